@@ -7,7 +7,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.nav.geodesy import GNSS_MOVES, LOCAL_MOVES
+from odocal_ros.nav.geodesy import MIN_GNSS_MOTION, MIN_LOCAL_MOTION
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.nav.time_series import NORMAL_MEDIAN
@@ -17,7 +17,7 @@ from odocal_ros.settings.levels import FASTEST
 
 # limits of a slide of locked wheels; more motion without counts is a fault of the odometer
 SLIDE_DISTANCE = 100.0      # m: physical
-SLIDE_TIME = 20.0           # s: physical; after a longer time, GNSS_MOVES is the limit
+SLIDE_TIME = 20.0           # s: physical; after a longer time, MIN_GNSS_MOTION is the limit
 MIN_UNCOUNTED_SHARE = 0.01   # judgement: share of the path without counts that is reported
 
 
@@ -155,7 +155,7 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
     for k in np.flatnonzero(end - begin > SLIDE_DISTANCE / FASTEST):
         # not at the end of the data: errors of the fixes of a parked vehicle move as far
         is_no_slide = end[k] - begin[k] > SLIDE_TIME and end[k] < travel.t[-1]
-        motion_limit = max(GNSS_MOVES if is_no_slide else SLIDE_DISTANCE, 10 * fix_sigma)
+        motion_limit = max(MIN_GNSS_MOTION if is_no_slide else SLIDE_DISTANCE, 10 * fix_sigma)
         distance = _motion_of_fixes(fixes[(t >= begin[k]) & (t <= end[k])], motion_limit)
         if distance >= motion_limit:
             motions.append((distance, begin[k], end[k]))
@@ -176,7 +176,7 @@ def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: f
             continue
         t, p = t_fix[rows], fixes_n[rows, :2]
         # at most a quarter of the distance: with noisy fixes, both ends remain two places
-        limit = min(max(LOCAL_MOVES, 10 * fix_sigma), distance / 4)
+        limit = min(max(MIN_LOCAL_MOTION, 10 * fix_sigma), distance / 4)
         # the places are medians of three fixes, of which one may be an outlier
         is_after_start, is_before_end = (np.hypot(*(p - np.median(place, axis=0)).T) > limit
                                          for place in (p[:3], p[-3:]))
@@ -200,7 +200,7 @@ def _motion_of_fixes(fixes: Floats, motion_limit: float) -> float:
 
 
 def path_and_chord(t_fix: Floats, fixes_n: Floats,
-                   min_distance: float = GNSS_MOVES) -> tuple[float, float]:
+                   min_distance: float = MIN_GNSS_MOTION) -> tuple[float, float]:
     """
     Return path length and distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 

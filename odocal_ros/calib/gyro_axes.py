@@ -18,9 +18,9 @@ import numpy as np
 from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.calib.track_check import ONE_MOTION_RATIO
 from odocal_ros.data.arrays import Floats, map_rows
-from odocal_ros.nav.geodesy import GNSS_MOVES
+from odocal_ros.nav.geodesy import MIN_GNSS_MOTION
 from odocal_ros.nav.rotations import arctan2
-from odocal_ros.nav.time_series import gaps_longer, integral_at, twice_integral_at
+from odocal_ros.nav.time_series import double_integral_at, gaps_longer, integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.gravity_fit import gravity_fit
 from odocal_ros.screening.imu_orientation import ImuOrientation
@@ -201,7 +201,7 @@ def _published_and_true(published: str, measured: str, ratio: float) -> tuple[st
 
 
 def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
-               sigma: float, min_motion: float = GNSS_MOVES) -> float | None:
+               sigma: float, min_motion: float = MIN_GNSS_MOTION) -> float | None:
     """
     Return turns by the gyro over turns of the course by fixes, None without correlation.
 
@@ -230,7 +230,7 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     t = ((ends[:-1] + ends[1:]) / 2)[keep]
     course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     # the mean angle over each chord; the effect of a bias is linear in time
-    gyro = (np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends))[keep]
+    gyro = (np.diff(double_integral_at(ends, t_imu, w_up)) / np.diff(ends))[keep]
     # at a sudden U-turn of the course the vehicle may have reversed, and the turn in a gap of the
     # IMU is unknown: a free step is fitted there
     restarts = np.flatnonzero((np.abs(np.diff(course)) > 2.0) | (np.diff(ended[1:][keep]) > 0))

@@ -36,8 +36,8 @@ class Normal:
     Normal equations H x = g of N blocks of n unknowns and of m constants, initially zero.
 
     diagonal : (N, n, n) H_k.   upper : (N - 1, n, n) H_k,k+1.   coupling : (N, n, m) of blocks and
-    constants.   corner : (m, m) of the constants.   g, g_constants : (N, n), (m,).   absent :
-    prior weights of further constants, on which no row depends; they appear only in the results.
+    constants.   corner : (m, m) of the constants.   g, g_constants : (N, n), (m,).
+    unused_weights : prior weights of further constants, on which no row depends.
     """
 
     def __init__(self, N: int, n: int, m: int) -> None:
@@ -48,7 +48,7 @@ class Normal:
         self.coupling = self.right_sides[:, :, n:n + m]
         self.g = self.right_sides[:, :, n + m]
         self.corner, self.g_constants = np.zeros((m, m)), np.zeros(m)
-        self.absent = np.zeros(0)
+        self.unused_weights = np.zeros(0)
 
 
 @dataclass(eq=False)
@@ -56,7 +56,7 @@ class Solved:
     """The solution, and the elimination from which the covariances are computed."""
 
     step: Floats              # (N, n) of the blocks
-    step_constants: Floats    # (m,), here and in the next four with the absent constants
+    step_constants: Floats    # (m,), here and in the next four with unused constants
     covariance: Floats        # (m, m) of the constants
     log_determinant: float    # of H
     reduced: Floats           # (m, m) Schur complement of the constants, (S24)
@@ -65,7 +65,7 @@ class Solved:
     # None after ``marginals``, which reuses their memory
     _elimination: tuple[Floats, Floats] | None
     _scale: Floats            # (N, n)
-    _scale_constants: Floats  # (m,) of those that are not absent
+    _scale_constants: Floats  # (m,) of the used ones
     step_fraction: float = 1.0    # of the full Gauss-Newton step that ``step`` is
 
     def marginals(self) -> 'JointMarginals':
@@ -228,7 +228,7 @@ def solve(normal: Normal) -> Solved:
     if info:
         raise NotPositive('the data do not determine the constants of the vehicle')
     logdet = 2 * sum(np.log(x).sum() for x in (roots / s, root.diagonal() / s_c)) \
-        + np.log(normal.absent).sum()
+        + np.log(normal.unused_weights).sum()
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
@@ -236,11 +236,11 @@ def solve(normal: Normal) -> Solved:
                         for rows in blocks(N)])
     for k in iterate_releasing(range(N - 2, -1, -1)):
         x[k] -= right_sides[k][:, :n] @ x[k + 1]
-    absent = normal.absent
+    unused = normal.unused_weights
     return Solved(
-        x * s, _with_absent(c * s_c, 0 * absent),
-        _with_absent(covariance * np.multiply.outer(s_c, s_c), 1 / absent), float(logdet),
-        _with_absent(reduced, absent), _with_absent(corner[:m, m] / s_c, 0 * absent),
+        x * s, _with_unused(c * s_c, 0 * unused),
+        _with_unused(covariance * np.multiply.outer(s_c, s_c), 1 / unused), float(logdet),
+        _with_unused(reduced, unused), _with_unused(corner[:m, m] / s_c, 0 * unused),
         (right_sides, normal.diagonal), s, s_c)
 
 
@@ -287,10 +287,10 @@ def _eliminate(normal: Normal, corner: Floats) -> Floats:
     return roots
 
 
-def _with_absent(x: Floats, absent: Floats) -> Floats:
-    """Return a vector, or a matrix by its diagonal, with the absent constants: (m,), (m, m)."""
+def _with_unused(x: Floats, unused: Floats) -> Floats:
+    """Return a vector, or a matrix by its diagonal, with the unused constants: (m,), (m, m)."""
     if x.ndim == 1:
-        return np.concatenate([x, absent])
-    out = np.diag(np.concatenate([np.zeros(len(x)), absent]))
+        return np.concatenate([x, unused])
+    out = np.diag(np.concatenate([np.zeros(len(x)), unused]))
     out[:len(x), :len(x)] = x
     return out

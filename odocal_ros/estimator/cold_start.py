@@ -42,7 +42,7 @@ class FittedTrack:
 
     X : (N,) scale units, complex, in L.   K : metres per unit.   chi : rad, rotation from X to the
     fixes at the first keyframe.   slope : rad/s, its change with time, None without fixes.
-    chi_at : (N,) rad, at the keyframes.   place : (N,) m, complex, in n.   height : (N,) m.
+    chi_t : (N,) rad, at the keyframes.   position : (N,) m, complex, in n.   height : (N,) m.
     scatter : m, of the fixes about the track.
     """
 
@@ -51,40 +51,43 @@ class FittedTrack:
         self.X = np.concatenate([[0.0], np.cumsum(step[:, 0] + 1j * step[:, 1])])
         inside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
         t_fix, fix = leg.t_fix[inside], leg.fixes_n[inside]
-        sigma = float(np.sqrt(np.median(leg.covariance_n[:, 0, 0])))
         z = fix[:, 0] + 1j * fix[:, 1]
-        at = np.interp(t_fix, t, self.X)
-        self.K, self.slope = leg.rough_scale, None
-        # weighted by length of the odometer: a jump of the fixes does not get a larger weight
-        track_step, fix_step = np.diff(at), np.diff(z)
-        self.chi = float(np.angle((
-            track_step.conj() * fix_step / np.maximum(np.abs(fix_step), sigma)).sum()))
-        for _ in range(2):
-            residual = self.K * np.exp(1j * self.chi) * at - z
-            keep, noise = find_inliers(np.stack([residual.real, residual.imag], -1), sigma)
-            flat = np.stack([at.real, at.imag], -1) * self.K
-            pieces = cut_pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
-            middle, rotation = pieces.t, -pieces.heading_error
-            if not len(middle):
-                break
-            centre = float(np.angle(np.exp(1j * rotation).sum()))
-            if len(rotation) > 1:
-                rotation = np.unwrap(centre + wrap(rotation - centre))
-            self.chi, self.slope = fit_robust_line(middle, rotation)
-            rows = np.interp(middle, t_fix, np.arange(len(t_fix)))
-            k = np.unique(np.round(rows).astype(int))
-            path, chord = np.abs(np.diff(at[k])), np.abs(np.diff(z[k]))
-            if (path > 0).any():
-                self.K = float(np.median(chord[path > 0] / path[path > 0]))
-        self.chi_at = self.chi + (self.slope or 0.0) * (t - t[0])
-        self.place = self._place(t, t_fix, z)
+        self._fit(t_fix, z, np.interp(t_fix, t, self.X), leg)
+        self.chi_t = self.chi + (self.slope or 0.0) * (t - t[0])
+        self.position = self._corrected(t, t_fix, z)
         self.height = _window_medians(t, t_fix, np.where(np.isnan(fix[:, 2]), 0.0, fix[:, 2]))
-        scatter = np.median(np.abs(np.interp(t_fix, t, self.place) - z))
+        scatter = np.median(np.abs(np.interp(t_fix, t, self.position) - z))
         self.scatter = max(float(scatter) / MEDIAN_RADIUS, 1e-3)
 
-    def _place(self, t: Floats, t_fix: Floats, z: Complexes) -> Complexes:
+    def _fit(self, t_fix: Floats, z: Complexes, X: Complexes, leg: SmootherLeg) -> None:
+        """Fit K, chi and its slope; z, X : (m,) fixes, m, and track at their times."""
+        sigma = float(np.sqrt(np.median(leg.covariance_n[:, 0, 0])))
+        self.K, self.slope = leg.rough_scale, None
+        # weighted by length of the odometer: a jump of the fixes does not get a larger weight
+        track_step, fix_step = np.diff(X), np.diff(z)
+        self.chi = float(np.angle((
+            track_step.conj() * fix_step / np.maximum(np.abs(fix_step), sigma)).sum()))
+        xy, fix_xy = (np.stack([x.real, x.imag], -1) for x in (X, z))
+        for _ in range(2):
+            residual = self.K * np.exp(1j * self.chi) * X - z
+            inliers, noise = find_inliers(np.stack([residual.real, residual.imag], -1), sigma)
+            pieces = cut_pieces((xy * self.K)[inliers], fix_xy[inliers], t_fix[inliers], noise)
+            rotation = -pieces.heading_error
+            if not len(rotation):
+                break
+            mean = float(np.angle(np.exp(1j * rotation).sum()))
+            if len(rotation) > 1:
+                rotation = np.unwrap(mean + wrap(rotation - mean))
+            self.chi, self.slope = fit_robust_line(pieces.t, rotation)
+            rows = np.interp(pieces.t, t_fix, np.arange(len(t_fix)))
+            k = np.unique(np.round(rows).astype(int))
+            path, chord = np.abs(np.diff(X[k])), np.abs(np.diff(z[k]))
+            if (path > 0).any():
+                self.K = float(np.median(chord[path > 0] / path[path > 0]))
+
+    def _corrected(self, t: Floats, t_fix: Floats, z: Complexes) -> Complexes:
         """Return the track plus the smoothed difference from the fixes: (N,) m, complex, in n."""
-        steps = np.diff(self.X) * np.exp(1j * (self.chi_at[:-1] + self.chi_at[1:]) / 2) * self.K
+        steps = np.diff(self.X) * np.exp(1j * (self.chi_t[:-1] + self.chi_t[1:]) / 2) * self.K
         path = np.concatenate([[0.0], np.cumsum(steps)])
         difference = z - np.interp(t_fix, t, path)
         east, north = (_window_medians(t, t_fix, x) for x in (difference.real, difference.imag))
@@ -116,18 +119,11 @@ class _Section:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A first state and its uncertainty, and what is needed for the state with another yaw."""
+    """A first state and its uncertainty."""
 
     state: State
     yaw_sigma: float        # rad, of the heading by accelerations
     fix_scatter: float      # m, scatter of the fixes about the track
-    leg: SmootherLeg
-    sections: list[_Section]
-    scale: float            # metres per unit of travel
-
-    def with_yaw(self, yaw: float) -> 'Start':
-        """Return the start with this yaw mounting, rad, instead of the one by acceleration."""
-        return replace(self, state=_join_sections(self.leg, self.sections, self.scale, yaw))
 
 
 def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
@@ -148,23 +144,23 @@ def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
         rotations = [np.exp(1j * (section.psi - section.track.chi)) for section in sections]
         yaw = float(np.angle(weight @ rotations)) if sigma <= 0.2 else 0.0
     return Start(_join_sections(leg, sections, K, yaw), float(sigma),
-                 float(np.median([section.track.scatter for section in sections])), leg, sections,
-                 K)
+                 float(np.median([section.track.scatter for section in sections])))
 
 
 def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Section]:
     """Return the sections of a leg, each of about SECTION_LENGTH or longer."""
     # one without enough fixes for a heading is joined with the next, the last with the one before
-    count = max(1, round(float(np.ptp(imu.t[imu.key])) / SECTION_LENGTH))
-    ends = np.linspace(0, len(imu.key) - 1, count + 1).astype(int).tolist()
+    count = max(1, round(float(np.ptp(imu.t_keyframes)) / SECTION_LENGTH))
+    ends = np.linspace(0, len(imu.keyframes) - 1, count + 1).astype(int).tolist()
     sections, firsts = list[_Section](), [0]
 
     def section_of(first: int, last: int) -> _Section:
         before = sections[-1].bias if sections else np.zeros(3)
-        return _estimate_section(leg, replace(imu, key=imu.key[first:last + 1]), priors, before)
+        part = replace(imu, keyframes=imu.keyframes[first:last + 1])
+        return _estimate_section(leg, part, priors, before)
 
     for last in ends[1:]:
-        begin, end = imu.t[imu.key[[firsts[-1], last]]]
+        begin, end = imu.t_keyframes[[firsts[-1], last]]
         if np.count_nonzero((leg.t_fix >= begin) & (leg.t_fix <= end)) < 2:
             continue
         section = section_of(firsts[-1], last)
@@ -179,11 +175,12 @@ def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[
 
 def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _Section:
     """Return a section; before : (3,) gyro bias of the section before it."""
-    rest = gyro_bias_at_rest(leg, imu)
-    bias = before if rest is None else rest
-    # rad/s, judgement: of a bias at rest, the drift of a consumer gyro in a leg
-    sigma = np.maximum(priors.gyro_bias_sigma, 1e-3) if rest is None else np.full(3, 2e-4)
-    count, change = len(imu.key) - 1, np.zeros(3)
+    bias_at_rest = gyro_bias_at_rest(leg, imu)
+    if bias_at_rest is None:
+        bias, sigma = before, np.maximum(priors.gyro_bias_sigma, 1e-3)
+    else:       # rad/s, judgement: the drift of a consumer gyro in a leg
+        bias, sigma = bias_at_rest, np.full(3, 2e-4)
+    count, change = len(imu.keyframes) - 1, np.zeros(3)
     at_bias, _ = preintegrate(imu, np.tile(bias, (count, 1)), np.zeros((count, 3)), leg.travel.at,
                               forward_b(0.0, 0.0), np.empty(0))        # no times within
     sums, C_0k = change_gyro_bias(at_bias, change)
@@ -193,7 +190,7 @@ def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: F
         sums, C_0k = change_gyro_bias(at_bias, change)
         sigma = np.minimum(sigma, 5e-4)
     C_Lk = level_frame(up) @ C_0k
-    t = imu.t[imu.key]
+    t = imu.t_keyframes
     track = FittedTrack(leg, t, C_Lk, sums)
     if track.slope is not None:
         up_b = C_Lk[:, 2].mean(axis=0)
@@ -229,8 +226,8 @@ def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     g = gravity(leg.origin.latitude, leg.origin.height)
     up = np.median(force, axis=0)
     up = up / np.linalg.norm(up)
-    lively = 1.0        # m/s^2, 1 sigma of the acceleration of a car over 1 s: physical
-    weight = np.sqrt(T) / lively
+    car_acceleration = 1.0      # m/s^2, 1 sigma over 1 s: physical
+    weight = np.sqrt(T) / car_acceleration
     change = np.zeros(3)
     for _ in range(3):
         J = np.concatenate([np.broadcast_to(np.eye(3) * g, (len(T), 3, 3)),
@@ -251,10 +248,10 @@ def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
     # force in L, plus a tilt (constant in L) and an accelerometer bias (constant in b)
     direction = C_Lk[:, 0, 0] + 1j * C_Lk[:, 1, 0]
     direction = direction / np.maximum(np.abs(direction), 1e-9)
-    v = track.K * odometer_speed(leg.travel.at, t) * direction * np.exp(1j * track.chi_at)
+    v = track.K * odometer_speed(leg.travel.at, t) * direction * np.exp(1j * track.chi_t)
     F = (C_Lk[:-1] @ sums.dv[:, :, None])[:, :, 0]
     F = F[:, 0] + 1j * F[:, 1]
-    drift = np.exp(1j * (track.chi_at[:-1] - track.chi))
+    drift = np.exp(1j * (track.chi_t[:-1] - track.chi))
     T = sums.T
     lag = min(3, len(T))        # intervals, to average noise: judgement
     columns = [np.convolve(c, np.ones(lag), 'valid')
@@ -267,9 +264,9 @@ def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
         H = (A.conj().T * w) @ A + 1e-9 * np.eye(3)
         x = np.linalg.solve(H, (A.conj().T * w) @ y)
         r = np.abs(y - A @ x)
-        usual = max(np.median(r) / MEDIAN_RADIUS, 1e-3)
-        w = np.minimum(1.0, 2 * usual / np.maximum(r, 1e-9))
-        sigma = usual * np.sqrt(lag * np.linalg.inv(H)[0, 0].real) / max(abs(x[0]), 1e-9)
+        scatter = max(np.median(r) / MEDIAN_RADIUS, 1e-3)
+        w = np.minimum(1.0, 2 * scatter / np.maximum(r, 1e-9))
+        sigma = scatter * np.sqrt(lag * np.linalg.inv(H)[0, 0].real) / max(abs(x[0]), 1e-9)
     # |x_0| is 1 if the accelerations are those of the track; half: judgement
     return float(np.angle(x[0])), float(sigma) if abs(x[0]) >= 0.5 else np.inf
 
@@ -278,15 +275,15 @@ def _state(leg: SmootherLeg, section: _Section, K: float, yaw: float) -> State:
     """Return the state of a section with scale and yaw mounting of the leg."""
     t, track, N = section.t, section.track, len(section.t)
     C_nL = np.zeros((N, 3, 3))
-    C_nL[:, 0, 0] = C_nL[:, 1, 1] = np.exp(1j * (track.chi_at + yaw)).real
-    C_nL[:, 1, 0] = np.exp(1j * (track.chi_at + yaw)).imag
+    C_nL[:, 0, 0] = C_nL[:, 1, 1] = np.exp(1j * (track.chi_t + yaw)).real
+    C_nL[:, 1, 0] = np.exp(1j * (track.chi_t + yaw)).imag
     C_nL[:, 0, 1], C_nL[:, 2, 2] = -C_nL[:, 1, 0], 1.0
     C_nb = C_nL @ section.C_Lk
     constants = np.zeros(M)
     constants[[LN_K, YAW, PITCH]] = np.log(K), yaw, 0.0
     v_n = (C_nb @ forward_b(yaw, 0.0)) * (K * odometer_speed(leg.travel.at, t))[:, None]
     v_n[:, 2] = 0.0
-    p_n = np.stack([track.place.real, track.place.imag, track.height], -1)
+    p_n = np.stack([track.position.real, track.position.imag, track.height], -1)
     return State(t, p_n, v_n, C_nb, gyro_bias=np.tile(section.bias, (N, 1)),
                  accel_bias=np.zeros((N, 3)), travel_error=np.zeros(N), slow_n=np.zeros((N, 3)),
                  constants=constants)
@@ -295,6 +292,6 @@ def _state(leg: SmootherLeg, section: _Section, K: float, yaw: float) -> State:
 def _join_sections(leg: SmootherLeg, sections: list[_Section], K: float, yaw: float) -> State:
     """Return the states of adjacent sections as one; their common keyframes appear once."""
     states = [_state(leg, section, K, yaw) for section in sections]
-    columns = [one.keyframe_arrays() for one in states]
+    columns = [state.keyframe_arrays() for state in states]
     return replace(states[0], **{name: np.concatenate([
         column[name][min(k, 1):] for k, column in enumerate(columns)]) for name in columns[0]})

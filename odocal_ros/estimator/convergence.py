@@ -53,10 +53,10 @@ FLAT_SIGMAS[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
 class Progress:
     """Convergence of a fit from pass to pass."""
 
-    def __init__(self, fitted: bool, frozen: bool, fewest: int) -> None:
-        """Start; fitted : use fitted signals; frozen : keep levels; fewest : passes at least."""
+    def __init__(self, fitted: bool, frozen: bool, min_passes: int) -> None:
+        """Start; fitted : use fitted signals.   frozen : levels are kept."""
         self.fitted = self.was_fitted = fitted      # in the next pass, in the last
-        self.frozen, self.fewest, self.converged = frozen, fewest, False
+        self.frozen, self.min_passes, self.converged = frozen, min_passes, False
         # sigmas of scale and mounting, largest change of their logarithms, the larger of it and of
         # their largest step in sigmas
         self.sigma, self.change, self.largest_change = np.ones(PARAMETER_COUNT), np.inf, np.inf
@@ -71,14 +71,14 @@ class Progress:
         before, self.sigma, last_change = self.sigma, sigma[:PARAMETER_COUNT], self.change
         self.change = np.abs(np.log(self.sigma / before)).max()
         self.largest_change = max(step[:PARAMETER_COUNT].max(), self.change)
-        steady = count > self.fewest and last_change < CONVERGENCE.max_last_sigma_change \
+        is_steady = count > self.min_passes and last_change < CONVERGENCE.max_last_sigma_change \
             and self.change < min(CONVERGENCE.max_sigma_change, last_change)
         self.converged = bool(self.fitted and self.largest_step < CONVERGENCE.max_step
-                              and (self.frozen or steady))
-        first_fitted, self.was_fitted = self.fitted and not self.was_fitted, self.fitted
-        self.fitted = first_fitted or self.largest_step < (
+                              and (self.frozen or is_steady))
+        is_first_fitted, self.was_fitted = self.fitted and not self.was_fitted, self.fitted
+        self.fitted = is_first_fitted or self.largest_step < (
             CONVERGENCE.measured_above if self.fitted else CONVERGENCE.fitted_below)
         # a first step with the fitted signal is never shortened: it corrects the error that noise
         # in the measured signal caused
-        fits_next = self.fitted and not self.was_fitted
-        self.previous_step = np.zeros(layout.M) if fits_next else solved.step_constants
+        next_is_first = self.fitted and not self.was_fitted
+        self.previous_step = np.zeros(layout.M) if next_is_first else solved.step_constants

@@ -27,7 +27,7 @@ from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer import SpeedSteps
 from odocal_ros.estimator.factors.point_rows import PointRows, rows_per_independent, TAIL_SIGMAS
 from odocal_ros.estimator.factors.slow_error import SlowError
-from odocal_ros.estimator.level_steps import prior_information, update_levels
+from odocal_ros.estimator.level_steps import LevelSteps, prior_information
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import Priors, State
@@ -51,8 +51,8 @@ WARM_START_PASSES = 6    # judgement: of a fit that starts from a converged one
 
 
 @dataclass(frozen=True, eq=False)
-class WarmStart:
-    """Initial values of a fit, from an earlier one."""
+class FitSummary:
+    """The result of a fit without its equations, which are large; start of a later fit."""
 
     state: State
     levels: Levels
@@ -60,22 +60,16 @@ class WarmStart:
     initial_priors: Priors   # without
     # (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals
     variance_factors: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class FitSummary(WarmStart):
-    """The result of the iteration without the equations, which are large."""
-
-    converged: bool          # also if slowly
+    converged: bool = False     # also if slowly
     # scale and mounting still change, by up to ``max_slow_step`` sigmas
-    slowly_converging: bool
-    iterations: int
-    likelihood: float        # logarithm of the restricted one, plus a constant; NaN: not iterated
+    slowly_converging: bool = False
+    iterations: int = 0
+    likelihood: float = np.nan  # logarithm of the restricted one, plus a constant
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(FitSummary):
-    """The result of the iteration, with the equations of its last pass."""
+    """The result of a fit, with the equations of its last pass."""
 
     weighted: Weighted
     solved: Solved
@@ -89,11 +83,11 @@ class Fit(FitSummary):
 
     def summary(self) -> FitSummary:
         """Return everything but the equations, so that their memory can be released."""
-        return FitSummary(**{one.name: getattr(self, one.name) for one in fields(FitSummary)})
+        return FitSummary(**{f.name: getattr(self, f.name) for f in fields(FitSummary)})
 
 
 def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40, *,
-        frozen: bool = False, warm_start: WarmStart | None = None,
+        frozen: bool = False, warm_start: FitSummary | None = None,
         trace: Trace | None = None) -> Fit:
     """
     Iterate from a state to the restricted maximum of the likelihood.
@@ -107,13 +101,13 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
     if warm_start:
         priors, initial_priors = warm_start.priors, warm_start.initial_priors
         variance_factors = warm_start.variance_factors
-    # first and last pass in which outliers are updated: the residuals of the first passes contain
-    # errors of the initial state; after the last one outliers must be constant to converge
-    first_tails, last_tails = 1 if warm_start else 3, 15
+    # passes in which outliers are updated: the residuals of earlier ones contain errors of the
+    # initial state; after the last one outliers must be constant to converge
+    outlier_passes = range(1 if warm_start else 3, 16)
     # pass that estimates the effective sample size; of two starts only that of the better one
     sample_size_pass = 3 if warm_start is None else 0 if problem.rows_per_independent else 1
-    pace: dict[str, tuple[float, float]] = {}
-    progress = Progress(warm_start is not None, frozen, first_tails + 2)
+    level_steps = LevelSteps(problem)
+    progress = Progress(warm_start is not None, frozen, outlier_passes.start + 2)
     count, state = 0, state.with_mean_up()
     while True:
         count += 1
@@ -131,11 +125,10 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
             problem.rows_per_independent = find_rows_per_independent(problem, weighted)
         if not frozen:
             marginals = solved.marginals()
-            old_levels = levels
-            levels = update_levels(weighted, marginals, levels, problem, pace, progress.was_fitted)
-            if first_tails <= count <= last_tails:
+            levels = level_steps.update(weighted, marginals, progress.was_fitted)
+            if count in outlier_passes:
                 variance_factors = update_variance_factors(weighted, marginals, variance_factors,
-                                                           old_levels, levels)
+                                                           levels)
                 priors = relax_priors(initial_priors, priors, state, solved, marginals)
             del marginals
         del weighted, solved      # before the next ones: the largest memory of a long leg
@@ -144,8 +137,9 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
     return Fit(state, levels, priors, initial_priors, variance_factors,
-               converged or slowly_converging, slowly_converging, count, likelihood, weighted,
-               solved, by_levels, find_constant_steps(weighted, solved))
+               converged or slowly_converging, slowly_converging, count, likelihood,
+               weighted=weighted, solved=solved, by_levels=by_levels,
+               constant_steps=find_constant_steps(weighted, solved))
 
 
 def damp_step(solved: Solved, previous_step: Floats) -> Solved:
@@ -166,15 +160,14 @@ def damp_step(solved: Solved, previous_step: Floats) -> Solved:
 
 
 def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
-                            variance_factors: Floats, levels: Levels,
-                            new_levels: Levels) -> Floats:
+                            variance_factors: Floats, new_levels: Levels) -> Floats:
     """
     Return the variance factors of outlier intervals: (K, VARIANCE_FACTOR_COUNT).
 
-    levels, new_levels : of this pass and of the next. Factors and levels multiply the variances
-    of the same rows: outliers are tested with the new levels.
+    new_levels : of the next pass. Factors and levels multiply the variances of the same rows:
+    outliers are tested with the new levels.
     """
-    rows = weighted[MotionRows]
+    rows, levels = weighted[MotionRows], weighted.levels
     jumps = np.zeros((2, len(variance_factors), 1))
     if 'slow' in weighted.factors:
         jumps = weighted[SlowError].jumps(marginals)

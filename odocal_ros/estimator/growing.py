@@ -26,7 +26,7 @@ from odocal_ros.errors import BadData
 from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.factors.factor import PARAMETER_COUNT, VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.factors.odometer import as_rolled, odometer_speed, SPEED_WINDOW
-from odocal_ros.estimator.fit import Fit, fit, Trace, WARM_START_PASSES, WarmStart
+from odocal_ros.estimator.fit import Fit, fit, FitSummary, Trace, WARM_START_PASSES
 from odocal_ros.estimator.imu import imu_rows, ImuSteps, nearest_samples
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.preintegrate import preintegrate
@@ -77,7 +77,7 @@ class GrowingFit:
     def __init__(self, cpu_s: Callable[[], float]) -> None:
         self._cpu_s = cpu_s
         self.cold_start_cpu_s = 0.0
-        self._last: WarmStart | None = None     # summary of the last fit, start of the next one
+        self._last: FitSummary | None = None     # summary of the last fit, start of the next one
         self._rows_per_independent: dict[str, float] = {}
         self._cold_start_length = 0.0      # s, length of the window at its last cold start
         # estimate of all finished windows; that with the window in progress, once this is long
@@ -116,7 +116,7 @@ class GrowingFit:
             self._candidate = WindowEnd(estimate, window.t_stop)
         return estimate
 
-    def _fit_window(self, last: WarmStart | None, window: SmootherLeg, config: Config,
+    def _fit_window(self, last: FitSummary | None, window: SmootherLeg, config: Config,
                     trace: Trace) -> RunningEstimate:
         """Return the estimate of the window in progress; raises BadData."""
         try:
@@ -132,7 +132,7 @@ class GrowingFit:
         self._rows_per_independent = problem.rows_per_independent
         return RunningEstimate(method, _parameter_sigmas(method), *_motion_summary(best.state))
 
-    def _fit(self, last: WarmStart | None, problem: Problem, config: Config, trace: Trace) -> Fit:
+    def _fit(self, last: FitSummary | None, problem: Problem, config: Config, trace: Trace) -> Fit:
         """Return the fit of a window, from the last fit if there is one and it can be extended."""
         problem.rows_per_independent = self._rows_per_independent
         duration = problem.leg.t_stop - problem.leg.t_begin
@@ -208,17 +208,17 @@ def make_imu_steps(leg: SmootherLeg, spacing: float) -> ImuSteps:
     first, t = imu_rows(leg)
     k = nearest_samples(t, np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing)
     inside = (t[k] > t[0] + spacing / 2) & (t[k] < t[-1] - spacing / 2)
-    key = np.unique(np.concatenate([[0], k[inside], [len(t) - 1]]))
-    return ImuSteps.between(leg, key + first)
+    keyframes = np.unique(np.concatenate([[0], k[inside], [len(t) - 1]]))
+    return ImuSteps.between(leg, first + keyframes)
 
 
-def extend_warm_start(last: WarmStart, problem: Problem) -> WarmStart | None:
+def extend_warm_start(last: FitSummary, problem: Problem) -> FitSummary | None:
     """
     Return the start from the last fit, extended to new keyframes.
 
     None if earlier keyframes differ, or the number of used constants: a sensor started to publish.
     """
-    t, last_t = problem.imu.t[problem.imu.key], last.state.t
+    t, last_t = problem.imu.t_keyframes, last.state.t
     rounding = 1e-6     # s
     nearest = np.clip(np.searchsorted(last_t, t - rounding), 0, len(last_t) - 1)
     same = np.abs(last_t[nearest] - t) < rounding
@@ -233,23 +233,22 @@ def extend_warm_start(last: WarmStart, problem: Problem) -> WarmStart | None:
                for first, end in zip(kept[:-1], kept[1:], strict=True)]
     variance_factors = np.concatenate([earlier, np.ones((len(t) - n, VARIANCE_FACTOR_COUNT))])
     levels = problem.initial_levels.replaced(**last.levels.values)
-    return WarmStart(_extend_by_dead_reckoning(state, problem) if n < len(t) else state, levels,
+    return FitSummary(_extend_by_dead_reckoning(state, problem) if n < len(t) else state, levels,
                      last.priors, problem.priors, variance_factors)
 
 
 def _extend_by_dead_reckoning(state: State, problem: Problem) -> State:
     """Return a state extended by dead reckoning with gyro and odometer to the new keyframes."""
     imu, leg, n = problem.imu, problem.leg, len(state.t)
-    key = imu.key[n - 1:]
-    rows = replace(imu, key=key)
-    new_count, c = len(key) - 1, state.constants
+    new = replace(imu, keyframes=imu.keyframes[n - 1:])
+    new_count, c = len(new.keyframes) - 1, state.constants
     out = {name: np.concatenate([value, np.repeat(value[-1:], new_count, axis=0)])
            for name, value in state.keyframe_arrays().items()}
-    t = out['t'] = imu.t[imu.key]
+    t = out['t'] = imu.t_keyframes
     out['travel_error'][n:] = 0.0
     f = state.scale * state.forward
     travel = as_rolled(leg.travel, c)
-    sums, _ = preintegrate(rows, out['gyro_bias'][n:], out['accel_bias'][n:], travel, f,
+    sums, _ = preintegrate(new, out['gyro_bias'][n:], out['accel_bias'][n:], travel, f,
                            np.empty(0), c)
     C = out['C_nb']
     for k in range(new_count):

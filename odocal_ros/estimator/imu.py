@@ -10,7 +10,7 @@ The passes of a fit integrate steps instead of samples: errors of the IMU are co
 step. The noise functions return sigmas by the grade of the IMU, and by standstills or samples.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def nearest_samples(t: Floats, times: Floats) -> Ints:
     return k
 
 
-def keyframes(leg: SmootherLeg, spacing: float) -> Ints:
+def keyframe_samples(leg: SmootherLeg, spacing: float) -> Ints:
     """Return the indices of samples about ``spacing``, s, apart: (K + 1,), increasing."""
     first, t = imu_rows(leg)
     grid = np.linspace(t[0], t[-1], max(1, round((t[-1] - t[0]) / spacing)) + 1)
@@ -69,8 +69,12 @@ def keyframes(leg: SmootherLeg, spacing: float) -> Ints:
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
-    """Sums over m steps of samples, with all their errors, in the axes of b at each start."""
+class ImuSteps:
+    """
+    The m steps of a leg, with keyframes at some of their ends.
+
+    The sums contain all errors of the samples, and are in the axes of b at the start of the step.
+    """
 
     turn: Floats        # (m, 3) rad, rotation vector from start to end
     turn_mean: Floats   # (m, 3) rad, its mean over the step: half of it if the rate is constant
@@ -78,26 +82,25 @@ class Steps:
     dp: Floats          # (m, 3) its integral, m
     signals: Floats     # (m, 6) integrals of turn rate, rad, and specific force, m/s, as measured
     longest: Floats     # (m,) s, longest time between two samples
-
-
-@dataclass(frozen=True, eq=False)
-class ImuSteps(Steps):
-    """The steps of a leg, and the keyframes at some of their ends."""
-
     t: Floats           # (m + 1,) s, ends of the steps
-    key: Ints           # (K + 1,) indices of the keyframes in t
+    keyframes: Ints     # (K + 1,) their indices in t
+
+    @property
+    def t_keyframes(self) -> Floats:
+        """Return the times of the keyframes, s: (K + 1,)."""
+        return self.t[self.keyframes]
 
     @classmethod
     def from_leg(cls, leg: SmootherLeg, spacing: float) -> 'ImuSteps':
         """Return the steps of a leg with keyframes about ``spacing``, s, apart."""
-        return cls.between(leg, keyframes(leg, spacing))
+        return cls.between(leg, keyframe_samples(leg, spacing))
 
     @classmethod
-    def between(cls, leg: SmootherLeg, key: Ints) -> 'ImuSteps':
-        """Return the steps of a leg; key : (K + 1,) indices of the samples at the keyframes."""
+    def between(cls, leg: SmootherLeg, keyframes: Ints) -> 'ImuSteps':
+        """Return the steps of a leg; keyframes : (K + 1,) indices of their samples."""
         edges = np.append(np.concatenate([
-            _edges(leg.t_imu, key[k:k + KEYFRAMES_IN_CACHE + 1])[:-1]
-            for k in range(0, len(key) - 1, KEYFRAMES_IN_CACHE)]), key[-1])
+            _edges(leg.t_imu, keyframes[k:k + KEYFRAMES_IN_CACHE + 1])[:-1]
+            for k in range(0, len(keyframes) - 1, KEYFRAMES_IN_CACHE)]), keyframes[-1])
         parts, first = [], 0
         while first < len(edges) - 1:
             last = int(np.searchsorted(edges, edges[first] + SAMPLES_IN_CACHE, side='right')) - 1
@@ -105,39 +108,45 @@ class ImuSteps(Steps):
             parts.append(_summed(leg, edges[first:last + 1]))
             first = last
             release_mapped_memory()
-        sums = {f.name: np.concatenate([getattr(part, f.name) for part in parts])
-                for f in fields(Steps)}
-        return cls(**sums, t=leg.t_imu[edges], key=np.searchsorted(edges, key))
+        turn, turn_mean, dv, dp, signals, longest = (
+            np.concatenate(x) for x in zip(*parts, strict=True))
+        return cls(turn, turn_mean, dv, dp, signals, longest, leg.t_imu[edges],
+                   np.searchsorted(edges, keyframes))
 
     def angle_covariances(self) -> Floats:
         """Return the scatter of the attitude in each interval: covariances (K, 3, 3) rad^2."""
         T = np.diff(self.t)
         angle = np.cumsum(self.turn, axis=0) - self.turn / 2
-        share = (T / np.repeat(self.over_intervals(T), np.diff(self.key)))[:, None]
+        share = (T / np.repeat(self.over_intervals(T), np.diff(self.keyframes)))[:, None]
         mean = self.over_intervals(angle * share)
         square = self.over_intervals(angle[:, :, None] * (angle * share)[:, None])
         return square - mean[:, :, None] * mean[:, None]
 
     def over_intervals(self, x: Floats) -> Floats:
         """Return the sums of a quantity of the steps over the keyframe intervals: (K, ...)."""
-        return np.add.reduceat(x, self.key[:-1])
+        return np.add.reduceat(x, self.keyframes[:-1])
 
 
-def _edges(t: Floats, key: Ints) -> Ints:
+def _edges(t: Floats, keyframes: Ints) -> Ints:
     """Return the indices of the samples at the ends of steps, all keyframes included: sorted."""
-    begin, T = t[key[:-1]], np.diff(t[key])
-    count = np.maximum(1, np.round(T / STEP))
-    interval = np.repeat(np.arange(len(T)), np.diff(key))
+    first, last = keyframes[[0, -1]]
+    begin, T = t[keyframes[:-1]], np.diff(t[keyframes])
+    step_count = np.maximum(1, np.round(T / STEP))
+    interval = np.repeat(np.arange(len(T)), np.diff(keyframes))     # of each sample
     rounding = 1e-6     # of a step: a sample at the end of a step is not moved into it by rounding
-    step = np.floor((t[key[0]:key[-1]] - begin[interval]) / T[interval] * count[interval]
+    step = np.floor((t[first:last] - begin[interval]) / T[interval] * step_count[interval]
                     + rounding)
-    new = np.r_[True, (np.diff(interval) > 0) | (np.diff(step) > 0)]
-    out: Ints = np.append(np.flatnonzero(new), key[-1] - key[0]) + key[0]
+    is_first = np.r_[True, (np.diff(interval) > 0) | (np.diff(step) > 0)]
+    out: Ints = np.append(np.flatnonzero(is_first), last - first) + first
     return out
 
 
-def _summed(leg: SmootherLeg, edges: Ints) -> Steps:
-    """Return the sums of m steps; edges : (m + 1,) indices of the samples at their ends."""
+def _summed(leg: SmootherLeg, edges: Ints) -> tuple[Floats, ...]:
+    """
+    Return turn, turn_mean, dv, dp, signals and longest of m steps, see ``ImuSteps``.
+
+    edges : (m + 1,) indices of the samples at their ends.
+    """
     rows = slice(edges[0], edges[-1] + 1)
     t, f = leg.t_imu[rows], leg.f_b[rows]
     first = edges[:-1] - edges[0]
@@ -163,8 +172,8 @@ def _summed(leg: SmootherLeg, edges: Ints) -> Steps:
     signals = np.concatenate([turn, (f[:-1] + f[1:]) / 2 * dt], axis=1)
     angle, _ = running(turn)
     mean = np.add.reduceat((angle + turn / 2) * dt, first) / np.add.reduceat(dt, first)
-    return Steps(rotvec_from_quat(at_end[last]), mean, dv, dp, np.add.reduceat(signals, first),
-                 np.maximum.reduceat(dt[:, 0], first))
+    return (rotvec_from_quat(at_end[last]), mean, dv, dp, np.add.reduceat(signals, first),
+            np.maximum.reduceat(dt[:, 0], first))
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:
@@ -184,7 +193,7 @@ def without_accelerometer(grade: Grade) -> Grade:
 def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict[str, float]:
     """Return the white noise variances at standstills, by sensor: 'gyro', 'accel'; {}: too few."""
     turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
-    T = np.diff(imu.t[imu.key])[:, None]
+    T = np.diff(imu.t_keyframes)[:, None]
     inside = at_rest[:-1] & at_rest[1:]
     rest = np.flatnonzero(inside)
     stops = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
@@ -226,7 +235,7 @@ def is_standing(leg: SmootherLeg, t: Floats) -> Bools:
 
 def gyro_bias_at_rest(leg: SmootherLeg, imu: ImuSteps) -> Floats | None:
     """Return the mean turn rate at standstills, (3,) rad/s; None if they are shorter than 1 s."""
-    first, last = imu.key[[0, -1]]
+    first, last = imu.keyframes[[0, -1]]
     inside = is_standing(leg, imu.t[first:last + 1])
     at_rest = inside[:-1] & inside[1:]
     length = float(np.diff(imu.t[first:last + 1])[at_rest].sum())

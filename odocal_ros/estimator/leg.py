@@ -40,7 +40,7 @@ class ExternalSamples:
                                 if isinstance(column, np.ndarray)})
 
 
-def thinned(t: Floats, max_rate: float = EXTERNAL_RATE) -> slice:
+def thinning(t: Floats, max_rate: float = EXTERNAL_RATE) -> slice:
     """Return a slice that thins sorted times, s, to a rate of about ``max_rate``, Hz."""
     rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9) if len(t) else 0.0
     return slice(None, None, max(1, round(rate / max_rate)))
@@ -52,7 +52,7 @@ def enu_to_n(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 
 
-def convergence(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
+def meridian_convergence(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
     """Return the meridian convergence, the yaw in n of east at the vehicle: (m,) rad."""
     C_np = enu_to_n(inputs, t, origin)
     return arctan2(C_np[:, 1, 0], C_np[:, 0, 0])

@@ -118,9 +118,9 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
     of which are subtracted.
     """
     out, points = [], []
-    t, K = imu.t, len(imu.key) - 1
-    interval = np.clip(np.searchsorted(t[imu.key], t_points, side='right') - 1, 0, K - 1)
-    size = max(1, int(STEPS_AT_A_TIME * K / len(t)))
+    K = len(imu.keyframes) - 1
+    interval = np.clip(np.searchsorted(imu.t_keyframes, t_points, side='right') - 1, 0, K - 1)
+    size = max(1, int(STEPS_AT_A_TIME * K / len(imu.t)))
     for first in range(0, K, size):
         last = min(first + size, K)
         inside = slice(np.searchsorted(interval, first), np.searchsorted(interval, last))
@@ -150,15 +150,17 @@ class _Chunk:
     Of n steps, in the axes of b at the start of their interval: R, v, p : attitude, velocity and
     position at the start of the step.   step_v, step_p : single and double integral of the force
     over it.   R_mean, R_double : the same of R, over dt.   time_since_start : s, of the step.
-    Of intervals: R_end, dv, dp.   by_gyro, by_accel : M_g and M_a of docs/method.md (S3).
+    Of intervals: first, end : first step, and first one after it.   R_end, dv, dp.   by_gyro,
+    by_accel : M_g and M_a of docs/method.md (S3).
     """
 
     def __init__(self, imu: ImuSteps, first: int, last: int, gyro_bias: Floats,
                  accel_bias: Floats, constants: Floats | None) -> None:
-        key = imu.key[first:last + 1]
-        rows = slice(key[0], key[-1])
-        self.t, self.key = imu.t[key[0]:key[-1] + 1], key - key[0]
-        self.interval = np.repeat(np.arange(len(key) - 1), np.diff(key))    # of each step
+        keyframes = imu.keyframes[first:last + 1]
+        rows = slice(keyframes[0], keyframes[-1])
+        self.t = imu.t[rows.start:rows.stop + 1]
+        self.first, self.end = keyframes[:-1] - rows.start, keyframes[1:] - rows.start
+        self.interval = np.repeat(np.arange(last - first), np.diff(keyframes))    # of each step
         self.dt = np.diff(self.t)
         self.longest, dt = imu.longest[rows], self.dt[:, None]
         biases = np.concatenate([gyro_bias, accel_bias], axis=1)[self.interval] * dt
@@ -179,9 +181,9 @@ class _Chunk:
         q = quat_multiply(quat_from_rotvec(-rotate(self.G, gyro)),
                           quat_from_rotvec(imu.turn[rows]))
         q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], q]))
-        to_start = quat_conjugate(q[self.key[:-1]])[self.interval]
+        to_start = quat_conjugate(q[self.first])[self.interval]
         self.R = matrix_from_quat(quat_multiply(to_start, q[:-1]))
-        self.R_end = matrix_from_quat(quat_multiply(to_start[self.key[1:] - 1], q[self.key[1:]]))
+        self.R_end = matrix_from_quat(quat_multiply(to_start[self.end - 1], q[self.end]))
         # an error that rotates the step uniformly turns a force by its time since the start
         self.growth = np.eye(3) + skew(self.turn) / 3
         dv, dp, rotation = imu.dv[rows], imu.dp[rows], rotate(self.growth, gyro)
@@ -191,7 +193,7 @@ class _Chunk:
         self.v, self.dv = self._running_sums(self.step_v)
         self.p, self.dp = self._running_sums(self.v * dt + self.step_p)
         self.R_mean, self.R_double = self.R @ self.G, self.R @ self.GG * dt[:, None]
-        self.time_since_start = self.t[:-1] - self.t[self.key[:-1]][self.interval]
+        self.time_since_start = self.t[:-1] - self.t[self.first][self.interval]
 
     def _gyro_effects(self, x: Floats) -> Floats:
         """Return the effects of a gyro's bias and constants, (n, 3, 3 + g), from (n, 3, 3, 6)."""
@@ -209,13 +211,13 @@ class _Chunk:
         """Return the sums since the start of the interval before each step, and over intervals."""
         total = np.cumsum(step, axis=0)
         before = total - step
-        start = before[self.key[:-1]]
-        return before - start[self.interval], total[self.key[1:] - 1] - start
+        start = before[self.first]
+        return before - start[self.interval], total[self.end - 1] - start
 
     def steps_of(self, t: Floats, interval: Ints) -> Ints:
         """Return the step that each time lies in."""
-        return np.clip(np.searchsorted(self.t, t, side='right') - 1, self.key[interval],
-                       self.key[interval + 1] - 1)
+        return np.clip(np.searchsorted(self.t, t, side='right') - 1, self.first[interval],
+                       self.end[interval] - 1)
 
     def sum_effects(self, steps: Ints) -> None:
         """
@@ -225,7 +227,7 @@ class _Chunk:
         ``_effects`` has the factors that depend on the end. moment : integral of f t over a step,
         divided by dt.   R_growth : R times ``growth``, effect of a rotation within the step.
         """
-        self.cuts = np.unique(np.concatenate([self.key[:-1], steps]))
+        self.cuts = np.unique(np.concatenate([self.first, steps]))
         dt, signals = self.dt[:, None], self.signals
         end, v, p = self.time_since_start[:, None] + dt, self.v + self.step_v, self.p + self.v * dt
         moment, R_growth = self.step_v - self.step_p / dt, self.R @ self.growth
@@ -256,7 +258,7 @@ class _Chunk:
 
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""
-        T, begin, ds = np.diff(self.t[self.key]), self.key[:-1], np.diff(travel(self.t))[:, None]
+        T, ds = self.t[self.end] - self.t[self.first], np.diff(travel(self.t))[:, None]
         S = self.R_mean * ds[:, :, None]      # of each step
         path_before, path = self._running_sums(S @ forward)
         path_after = path[self.interval] - path_before - S @ forward
@@ -264,13 +266,14 @@ class _Chunk:
         in_step = forward_x / 2 + (turn_x @ forward_x + skew(np.cross(self.turn, forward))) / 6
         S_by_gyro = np.add.reduceat(_times(
             _cross(path_after, self.R_mean) + self.R @ in_step * ds[:, :, None],
-            self.signals[:, OF_GYRO]), begin)
+            self.signals[:, OF_GYRO]), self.first)
         A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
-            begin, self.key[1:], self.dv, self.dp, T[:, None, None])
-        rate, force = np.hsplit(np.add.reduceat(self.signals[:, 1:7], begin) / T[:, None], 2)
+            self.first, self.end, self.dv, self.dp, T[:, None, None])
+        rate, force = np.hsplit(
+            np.add.reduceat(self.signals[:, 1:7], self.first) / T[:, None], 2)
         return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, R_by_gyro, dv_by_gyro,
-                         dp_by_gyro, np.add.reduceat(S, begin), self._gyro_effects(S_by_gyro),
-                         rate, force, np.maximum.reduceat(self.longest, begin))
+                         dp_by_gyro, np.add.reduceat(S, self.first), self._gyro_effects(S_by_gyro),
+                         rate, force, np.maximum.reduceat(self.longest, self.first))
 
     def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:
         """Return the sums to times t in steps j: rate and force change uniformly in a step."""
@@ -282,9 +285,9 @@ class _Chunk:
         rate_change = 6 * (self.turn[j] - 2 * self.turn_mean[j]) / dt**2
         rate = self.turn[j] / dt - rate_change * dt / 2
         R = self.R[j] @ exp_so3(rate * h + rate_change * h**2 / 2)
-        tau = t - self.t[self.key[interval]]
+        tau = t - self.t[self.first[interval]]
         A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
-            self.key[interval], j, dv, dp, tau[:, None, None])
+            self.first[interval], j, dv, dp, tau[:, None, None])
         # the effects of errors in the step up to the time
         share, signals = (h / dt)[:, None], self.signals[j]
         turn = self._gyro_effects(_times(self.R_mean[j] * share, signals[:, OF_GYRO]))

@@ -11,7 +11,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import EXTERNAL_FACTORS, FACTORS
 from odocal_ros.estimator.factors.axle import mean_rates_at, WARM_TIME
-from odocal_ros.estimator.factors.gnss import whitener
+from odocal_ros.estimator.factors.gnss import inverse_cholesky
 from odocal_ros.estimator.factors.interval_noise import total_turn
 from odocal_ros.estimator.factors.pseudo_observations import SHARED
 from odocal_ros.estimator.imu import (
@@ -21,7 +21,7 @@ from odocal_ros.estimator.imu import (
     white_noise_at_rest,
     without_accelerometer,
 )
-from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, FIX_RATE, SmootherLeg, thinned
+from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, FIX_RATE, SmootherLeg, thinning
 from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import Origin
@@ -64,7 +64,7 @@ def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: F
         fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
     earlier = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = min(0.0, float(earlier[-1][0])) if earlier else 0.0
-    kept = thinned(inputs.t_fix, FIX_RATE)
+    kept = thinning(inputs.t_fix, FIX_RATE)
     return SmootherLeg(
         origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
         w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel.smoothed(), t_fix=inputs.t_fix[kept],
@@ -85,7 +85,7 @@ def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: F
 def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
     """Return the estimation problem of a leg; imu : its steps, by default with SPACING."""
     imu = ImuSteps.from_leg(leg, SPACING) if imu is None else imu
-    t = imu.t[imu.key]
+    t = imu.t_keyframes
     at_rest = is_standing(leg, t)
     used_fixes = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
     config = replace(config, imu=with_grade_by_noise(
@@ -95,14 +95,17 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
     external = {name: samples.between(t[0], t[-1]) for name, samples in leg.external.items()}
     unshared_constants = {kind.source: kind.constants for kind in EXTERNAL_FACTORS
                           if kind.name in leg.external and kind.name not in SHARED}
-    whitening = whitener(leg.covariance_n[used_fixes], np.isnan(leg.fixes_n[used_fixes, 2]))
+    no_height = np.isnan(leg.fixes_n[used_fixes, 2])
+    # poses can be from motion capture; fixes and points are less accurate
+    is_pose = leg.origin.is_local and not config.reference.points
     problem = Problem(
-        leg, imu, grade, _priors(config, grade, leg), used_fixes, whitening, at_rest,
-        {name: samples for name, samples in external.items() if len(samples.t)},
-        unshared_constants, total_turn(leg, imu), config.gnss.correlation_time,
-        mean_rates_at(leg.t_imu, leg.w_b, t), imu.angle_covariances(), drift_time(leg, t),
-        # poses can be from motion capture; fixes and points are less accurate
-        MIN_NOISE.fix if not leg.origin.is_local or config.reference.points else MIN_NOISE.pose)
+        leg=leg, imu=imu, grade=grade, priors=_priors(config, grade, leg), used_fixes=used_fixes,
+        fix_whitening=inverse_cholesky(leg.covariance_n[used_fixes], no_height), at_rest=at_rest,
+        external={name: samples for name, samples in external.items() if len(samples.t)},
+        unshared_constants=unshared_constants, total_turn=total_turn(leg, imu),
+        correlation_time=config.gnss.correlation_time,
+        rate_b=mean_rates_at(t, leg.t_imu, leg.w_b), angle_covariances=imu.angle_covariances(),
+        drift_time=drift_time(leg, t), min_fix_sigma=MIN_NOISE.pose if is_pose else MIN_NOISE.fix)
     for kind in FACTORS:
         if kind.is_present(problem):
             initial, minimum = kind.initial_levels(problem)

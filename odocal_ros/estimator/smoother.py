@@ -21,7 +21,7 @@ from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.estimates import implausible_imu_reasons, refused_result
 from odocal_ros.estimator.result.outcome import make_result
-from odocal_ros.estimator.state import Priors, SPEED_OFFSET, State, YAW
+from odocal_ros.estimator.state import M, SPEED_OFFSET, State, YAW
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -88,30 +88,25 @@ def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fi
     constants[SPEED_OFFSET] = nearer
     summary = current.summary()
     del current             # its equations: only one fit is in memory at a time
-    fixed_sigma = 1e-3 * coarse.step       # practically fixed
-    priors, initial_priors = (_fix_offset_priors(one, nearer, fixed_sigma)
-                              for one in (summary.priors, summary.initial_priors))
+    is_offset = np.arange(M) == SPEED_OFFSET
+    priors, initial_priors = (
+        replace(one, mean=np.where(is_offset, nearer, one.mean),
+                sigma=np.where(is_offset, 1e-3 * coarse.step, one.sigma))     # practically fixed
+        for one in (summary.priors, summary.initial_priors))
     warm_start = replace(summary, priors=priors, initial_priors=initial_priors)
     last = fit(problem, replace(warm_start.state, constants=constants), warm_start.levels,
                WARM_START_PASSES, warm_start=warm_start, frozen=True, trace=trace)
     return replace(last, iterations=warm_start.iterations + last.iterations)
 
 
-def _fix_offset_priors(priors: Priors, value: float, sigma: float) -> Priors:
-    """Return priors with this mean and sigma of the speed offset."""
-    means, sigmas = priors.mean.copy(), priors.sigma.copy()
-    means[SPEED_OFFSET], sigmas[SPEED_OFFSET] = value, sigma
-    return replace(priors, mean=means, sigma=sigmas)
-
-
 def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> Fit:
     """Return the fit from the cold start, or from the configured yaw if it is more likely."""
     nominal, has_accelerometer = nominal_yaw(config), problem.leg.has_accelerometer
-    start = cold_start(problem.leg, problem.imu, problem.priors,
-                       None if has_accelerometer else nominal)
+    leg, imu = problem.leg, problem.imu
+    start = cold_start(leg, imu, problem.priors, None if has_accelerometer else nominal)
     starts, passes = [start], config.leg.compute_limit
     if has_accelerometer and start.yaw_sigma > AMBIGUOUS_HEADING:
-        other = start.with_yaw(nominal)
+        other = cold_start(leg, imu, problem.priors, nominal)
         yaw_difference = wrap(other.state.constants[YAW] - start.state.constants[YAW])
         starts += [other] * bool(abs(yaw_difference) > AMBIGUOUS_HEADING)
     if len(starts) == 1:

@@ -21,7 +21,7 @@ from odocal_ros.estimator.factors.factor import VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.factors.heading import CONFIGURED_NOISE, Heading
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.estimator.fit import Fit
-from odocal_ros.estimator.imu import ImuSteps, keyframes, sensor_noise
+from odocal_ros.estimator.imu import ImuSteps, keyframe_samples, sensor_noise
 from odocal_ros.estimator.leg import BEFORE_MARK, EXTERNAL_RATE, ExternalSamples, SmootherLeg
 from odocal_ros.estimator.level_steps import SLIP_LEVELS
 from odocal_ros.estimator.levels import Levels
@@ -102,8 +102,8 @@ def ideal_samples(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> IdealS
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
         external=_heading(drive, config, t_begin, spacing))
-    key = keyframes(leg, spacing)
-    return IdealSamples(leg, ImuSteps.between(leg, key), _true_state(motion, key),
+    keyframes = keyframe_samples(leg, spacing)
+    return IdealSamples(leg, ImuSteps.between(leg, keyframes), _true_state(motion, keyframes),
                         max(1.0, (drive.duration - t_begin) * sigmas.fix_rate / len(t_fix)))
 
 
@@ -217,8 +217,8 @@ def fit_at_truth(problem: Problem, ideal: IdealSamples, levels: Levels) -> Fit:
     state, priors = ideal.state, problem.priors
     weighted = Weighted(Equations(problem, state, priors), levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, VARIANCE_FACTOR_COUNT)),
-               converged=True, slowly_converging=False, iterations=0, likelihood=np.nan,
-               weighted=weighted, solved=weighted.solved(), by_levels=np.zeros((M, 0)))
+               converged=True, weighted=weighted, solved=weighted.solved(),
+               by_levels=np.zeros((M, 0)))
 
 
 @dataclass(frozen=True, eq=False)

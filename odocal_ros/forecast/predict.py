@@ -27,9 +27,9 @@ from odocal_ros.nav.alignment import (
     COMPASS_LIMIT,
     COURSE_DISTANCE,
     gyrocompass,
-    Level,
     level_at_rest,
     level_in_motion,
+    LevelAttitude,
     make_alignment,
     MOTION_LEVEL,
 )
@@ -230,7 +230,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
     return alignment, level_reasons + heading_reasons
 
 
-def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> Level:
+def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> LevelAttitude:
     """Return the level of a standstill from the mean of its planned samples."""
     span = (span[0], min(span[1], drive.duration))
     C_bn = rotations.transpose(drive.C_nb[int(np.searchsorted(drive.t, span[0]))])
@@ -240,7 +240,7 @@ def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade)
                          grade, grade.gyro_noise)
 
 
-def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
+def _level_in_motion(drive: PlannedDrive, grade: Grade) -> LevelAttitude:
     """Return the level from the first half minute of driving."""
     rows = (drive.t >= 0.0) & (drive.t <= MOTION_LEVEL)
     if rows.sum() < 2:
@@ -254,7 +254,7 @@ def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
                            drive.speed[rows][[0, -1]], drive.latitude, grade)
 
 
-def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, level: Level,
+def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, level: LevelAttitude,
              grade: Grade) -> tuple[float, float, str, tuple[Reason, ...]]:
     """Return yaw, rad, its sigma and the source of the heading, and reasons."""
     yaw = float(np.interp(level.t, drive.t, drive.yaw))

@@ -4,8 +4,8 @@
 """
 Alignment: level, gyro bias and heading at the start of a leg, each with its sigma.
 
-First the level from the specific force, at rest or in motion (``Level``), then with a heading the
-``Alignment``. It is an input of the pure pipeline, so that a simulation can put errors in it.
+The specific force gives the ``LevelAttitude``, at rest or in motion. With a heading it becomes the
+``Alignment``, an input of the pure pipeline, so that a simulation can put errors in it.
 """
 
 from dataclasses import dataclass, field
@@ -58,9 +58,9 @@ class Alignment:
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class LevelAttitude:
     """
-    Level and turn rate before the heading is known.
+    Attitude without heading, and turn rate.
 
     Frame L is level; its x axis is the horizontal projection of the x axis of b.
     """
@@ -90,7 +90,7 @@ def level_to_n_rotation(yaw: float) -> Floats:
 
 
 def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[float, float],
-                  grade: Grade, gyro_noise: float) -> Level:
+                  grade: Grade, gyro_noise: float) -> LevelAttitude:
     """
     Return the level near the end of a standstill, from its mean specific force.
 
@@ -99,22 +99,22 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
     An accelerometer bias tilts the level by bias / g. The gyro bias is a random walk: its mean
     differs from its last value by a third of the variance over the standstill.
     """
-    cut = min(REST_EDGE, (span[1] - span[0]) / 4)
-    inside = (t >= span[0] + cut) & (t <= span[1] - cut)
+    edge = min(REST_EDGE, (span[1] - span[0]) / 4)
+    inside = (t >= span[0] + edge) & (t <= span[1] - edge)
     if not inside.any():        # rows only at its ends
         inside = (t >= span[0]) & (t <= span[1])
-    length = max(span[1] - span[0] - 2 * cut, 1e-3)
+    length = max(span[1] - span[0] - 2 * edge, 1e-3)
     up_b = f_b[inside].mean(axis=0)
     g = np.linalg.norm(up_b)
     sigma = np.hypot(grade.level_bias, grade.accel_noise / np.sqrt(length)) / g
     end = t[inside][-1]
     rate_sigma = np.hypot(gyro_noise / np.sqrt(length), grade.gyro_bias_walk * np.sqrt(length / 3))
-    return Level(float(end), level_frame(up_b), float(sigma), w_b[inside].mean(axis=0),
-                 float(rate_sigma), (float(span[0]), float(span[1])))
+    return LevelAttitude(float(end), level_frame(up_b), float(sigma), w_b[inside].mean(axis=0),
+                         float(rate_sigma), (float(span[0]), float(span[1])))
 
 
 def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitude: float,
-                    grade: Grade) -> Level:
+                    grade: Grade) -> LevelAttitude:
     """
     Return the level from the mean specific force in motion, corrected for the change of velocity.
 
@@ -129,19 +129,19 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     T = t[-1] - t[0]
     C_0b = matrix_from_quat(q_0b)
     f_0 = rotate(C_0b, f_b)
-    lift = np.sum((f_0[:-1] + f_0[1:]) / 2 * np.diff(t)[:, None], axis=0)
-    up_0 = lift - (C_0b[-1][:, 0] * speed[1] - C_0b[0][:, 0] * speed[0])
+    f_integral = np.sum((f_0[:-1] + f_0[1:]) / 2 * np.diff(t)[:, None], axis=0)
+    up_0 = f_integral - (C_0b[-1][:, 0] * speed[1] - C_0b[0][:, 0] * speed[0])
     g = gravity(latitude, 0.0)
-    fastest = np.abs(speed).max()
+    max_speed = np.abs(speed).max()
     # rotation of the level until half of the interval, and Coriolis acceleration 2 Omega v
-    earth = OMEGA * (T / 2 + 2 * fastest / g)
-    mounting = 0.05 * fastest / (g * T)
-    parts = (grade.level_bias / g, grade.gyro_bias * T / 2, earth, mounting)
-    return Level(float(t[0]), level_frame(up_0), float(np.linalg.norm(parts)), np.zeros(3),
-                 0.0, None)
+    earth = OMEGA * (T / 2 + 2 * max_speed / g)
+    mounting = 0.05 * max_speed / (g * T)
+    errors = (grade.level_bias / g, grade.gyro_bias * T / 2, earth, mounting)
+    return LevelAttitude(float(t[0]), level_frame(up_0), float(np.linalg.norm(errors)),
+                         np.zeros(3), 0.0, None)
 
 
-def gyrocompass(level: Level, latitude: float, grade: Grade) -> tuple[float, float]:
+def gyrocompass(level: LevelAttitude, latitude: float, grade: Grade) -> tuple[float, float]:
     """
     Return the ENU yaw of L's x axis and its sigma, rad, from the Earth rate measured at rest.
 
@@ -150,11 +150,11 @@ def gyrocompass(level: Level, latitude: float, grade: Grade) -> tuple[float, flo
     """
     rate_L = level.C_Lb @ level.mean_rate_b
     yaw = wrap(np.pi / 2 - np.arctan2(rate_L[1], rate_L[0]))
-    gyro = np.hypot(grade.gyro_bias, level.rate_sigma) / (OMEGA * np.cos(latitude))
-    return float(yaw), float(np.hypot(gyro, level.level_sigma * np.tan(latitude)))
+    by_gyro = np.hypot(grade.gyro_bias, level.rate_sigma) / (OMEGA * np.cos(latitude))
+    return float(yaw), float(np.hypot(by_gyro, level.level_sigma * np.tan(latitude)))
 
 
-def earth_rate_deviation(level: Level, latitude: float, grade: Grade) -> float:
+def earth_rate_deviation(level: LevelAttitude, latitude: float, grade: Grade) -> float:
     """Return the deviation of the rate at rest from the Earth's, level or up, in sigmas."""
     rate_L = level.C_Lb @ level.mean_rate_b
     level_rate, up_rate = OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)
@@ -164,7 +164,7 @@ def earth_rate_deviation(level: Level, latitude: float, grade: Grade) -> float:
     return float(np.abs(deviation / sigma).max())
 
 
-def make_alignment(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bool,
+def make_alignment(level: LevelAttitude, yaw: float, yaw_sigma: float, source: str, shared: bool,
                    origin: Origin, grade: Grade, gyro_noise: float) -> Alignment:
     """
     Return the Alignment by a level and a heading, with the gyro bias by a standstill.
@@ -179,7 +179,7 @@ def make_alignment(level: Level, yaw: float, yaw_sigma: float, source: str, shar
                      grade.gyro_scale_sigma, grade.axis_error)
 
 
-def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, origin: Origin,
+def _gyro_bias_n(level: LevelAttitude, C_nb: Floats, yaw_sigma: float, origin: Origin,
                  grade: Grade) -> tuple[Floats, Floats]:
     """
     Return gyro bias and its sigma, ENU: the mean rate at rest minus the Earth's.

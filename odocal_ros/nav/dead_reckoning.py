@@ -17,15 +17,15 @@ from numpy.typing import ArrayLike
 
 from odocal_ros.data.arrays import chunks, Floats, running_sum, work_array
 from odocal_ros.nav import geodesy
-from odocal_ros.nav.geodesy import C_en, GNSS_MOVES, gravity
+from odocal_ros.nav.geodesy import C_en, gravity, MIN_GNSS_MOTION
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.nav.time_series import robust_sigma
 
 SHORT_SECTION = 2.0     # m, judgement: correlated fix errors change by less in that path
-# judgement: least ratio of scales by short and long sections if the path folds back; noise of an
-# eighth of a chord makes the short one 1 % longer
-FOLDED = 1.3
+# judgement: ratio of scales by short and long sections above which the path folds back; noise of
+# an eighth of a chord makes the short one 1 % longer
+MIN_FOLD_RATIO = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
-                min_chord: float = GNSS_MOVES) -> float | None:
+                min_chord: float = MIN_GNSS_MOTION) -> float | None:
     """
     Return metres per unit of travel from distances between fixes, None without motion.
 
@@ -142,7 +142,7 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
     # third differences of white noise have 20 times its variance
     noise = robust_sigma(np.diff(p, 3, axis=0)) / np.sqrt(20)
     short = section_ratio(s, s[:, None], p, max(SHORT_SECTION, 8 * noise))
-    return short if short is not None and short > FOLDED * scale else scale
+    return short if short is not None and short > MIN_FOLD_RATIO * scale else scale
 
 
 def section_ratio(s: Floats, path: Floats, p: Floats, min_chord: float) -> float | None:
@@ -157,10 +157,10 @@ def section_ratio(s: Floats, path: Floats, p: Floats, min_chord: float) -> float
     while pieces and path_length[-1] > 0:
         k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
         chord = np.hypot(*np.diff(p[k], axis=0).T)
-        run = np.sqrt((np.diff(path[k], axis=0)**2).sum(axis=1))
-        moves = run > 0
+        path_chord = np.sqrt((np.diff(path[k], axis=0)**2).sum(axis=1))
+        moves = path_chord > 0
         if moves.any() and np.median(chord[moves]) >= min_chord:
-            return float(np.median(chord[moves] / run[moves]))
+            return float(np.median(chord[moves] / path_chord[moves]))
         pieces //= 2
     return None
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 
-# longest interval of interpolation. Judgement: at 0.5 m/s and 1 rad/s a straight line between the
+# judgement: longest interval of interpolation. At 0.5 m/s and 1 rad/s a straight line between the
 # positions is up to v w T^2 / 8 = 16 mm off the path
-LONGEST_STEP_NS = 500_000_000
+MAX_INTERPOLATION_NS = 500_000_000
 RESTART_NS = 10**9        # judgement: a larger backward step of the stamps is a restart
 MAX_WAITING = 10_000     # judgement: transforms of a frame kept while another one is missing
 StampedPositions = tuple[Ints, Ints, Floats]      # stamps, arrivals, positions
@@ -44,8 +44,8 @@ class _MovingFrame:
 
     def drop_oldest(self, count: int) -> None:
         count = max(count, 0)
-        for held in (self.stamps, self.received, self.values):
-            del held[:count]
+        for column in (self.stamps, self.received, self.values):
+            del column[:count]
 
 
 class FrameChain:
@@ -70,18 +70,18 @@ class FrameChain:
             ) -> None:
         """Add a transform with a stamp; the first parent of a child applies."""
         if self._path is None or child in self._path:
-            edge = self._moving.setdefault(child, _MovingFrame(parent))
-            if edge.parent != parent:
+            frame = self._moving.setdefault(child, _MovingFrame(parent))
+            if frame.parent != parent:
                 return
-            if stamp_ns < edge.newest_ns - RESTART_NS:
+            if stamp_ns < frame.newest_ns - RESTART_NS:
                 self._computed.append(self._compute_positions())
                 for other in self._moving.values():
                     other.drop_oldest(len(other.stamps))
                     other.newest_ns = -1
-            if len(edge.stamps) == MAX_WAITING:
+            if len(frame.stamps) == MAX_WAITING:
                 self._computed.append(self._compute_positions())
-                edge.drop_oldest(len(edge.stamps) - MAX_WAITING + 1)
-            edge.add(stamp_ns, received_ns, values)
+                frame.drop_oldest(len(frame.stamps) - MAX_WAITING + 1)
+            frame.add(stamp_ns, received_ns, values)
 
     def add_static(self, child: str, parent: str, values: Values) -> None:
         """Add a static transform; the first one of a child applies."""
@@ -89,7 +89,8 @@ class FrameChain:
 
     @property
     def frames(self) -> list[str]:
-        parents = {e.parent for e in self._moving.values()} | {p for p, _ in self._static.values()}
+        """Return the names of all known frames, sorted."""
+        parents = {x.parent for x in self._moving.values()} | {p for p, _ in self._static.values()}
         return sorted(parents | set(self._moving) | set(self._static))
 
     def top(self) -> str:
@@ -118,54 +119,55 @@ class FrameChain:
 
     def _compute_positions(self) -> StampedPositions:
         """Return the new positions since the last restart of the stamps."""
-        nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))
+        empty = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))
         if self._path is None:
             top, path = self._walk()
             if top != self.parent or not self.is_moving():
-                return nothing
+                return empty
             self._path = path
-            self._moving = {name: e for name, e in self._moving.items() if name in path}
+            self._moving = {name: x for name, x in self._moving.items() if name in path}
         first, *others = (self._moving[name] for name in self._path if name in self._moving)
-        # rows of the first moving frame up to the newest stamp of all others
-        known_ns = min((edge.newest_ns for edge in others), default=first.newest_ns)
+        # first: the moving frame next to the parent; its rows up to the newest stamp of all others
+        known_ns = min((frame.newest_ns for frame in others), default=first.newest_ns)
         n = int(np.searchsorted(first.stamps, known_ns, side='right'))
         if not n:
-            return nothing
+            return empty
         stamps, received = np.array(first.stamps[:n]), np.array(first.received[:n])
-        position, good = np.zeros((n, 3)), np.ones(n, bool)
+        position, is_usable = np.zeros((n, 3)), np.ones(n, bool)
         if others:      # a repeated correction gives no position
             before = [self._last_correction or first.values[0], *first.values]
-            good = np.array([a != b for a, b in zip(before, first.values[:n], strict=False)])
+            is_usable = np.array([a != b for a, b in zip(before, first.values[:n], strict=False)])
             self._last_correction = first.values[n - 1]
         for name in reversed(self._path):
-            values: Floats = np.array([self._static[name][1]]) if name not in self._moving else (
-                np.array(first.values[:n]))
-            edge = self._moving.get(name, first)
-            if edge is not first:
-                values, near = _interpolate(edge, stamps)
-                good &= near
+            if name not in self._moving:
+                values = np.array([self._static[name][1]])
+            elif self._moving[name] is first:
+                values = np.array(first.values[:n])
+            else:
+                values, is_near = _interpolate(self._moving[name], stamps)
+                is_usable &= is_near
             position = _to_parent_frame(values, position)
         first.drop_oldest(n)
-        for edge in others:     # the previous one is needed for later positions
-            edge.drop_oldest(int(np.searchsorted(edge.stamps, stamps[-1], side='right')) - 1)
-        return stamps[good], received[good], position[good]
+        for frame in others:     # the previous one is needed for later positions
+            frame.drop_oldest(int(np.searchsorted(frame.stamps, stamps[-1], side='right')) - 1)
+        return stamps[is_usable], received[is_usable], position[is_usable]
 
 
-def _interpolate(edge: _MovingFrame, stamps: Ints) -> tuple[Floats, Bools]:
+def _interpolate(frame: _MovingFrame, stamps: Ints) -> tuple[Floats, Bools]:
     """Return the transforms of a frame at stamps, (n, 7), and a mask of usable ones, (n,)."""
-    t, values = np.array(edge.stamps), np.array(edge.values)
+    t, values = np.array(frame.stamps), np.array(frame.values)
     before = np.searchsorted(t, stamps, side='right') - 1
-    good = before >= 0
+    is_usable = before >= 0
     before = np.maximum(before, 0)
     after = np.minimum(before + 1, len(t) - 1)
     step, elapsed = t[after] - t[before], stamps - t[before]
-    good &= (elapsed == 0) | (step <= LONGEST_STEP_NS) & (elapsed <= step)
+    is_usable &= (elapsed == 0) | (step <= MAX_INTERPOLATION_NS) & (elapsed <= step)
     share = (elapsed / np.maximum(step, 1))[:, None]
     a, b = values[before], values[after].copy()
     # q and -q are the same rotation. Not slerp: the direction differs by less than angle^3 / 100
     opposite = a[:, 3] * b[:, 3] + a[:, 4] * b[:, 4] + a[:, 5] * b[:, 5] + a[:, 6] * b[:, 6] < 0
     b[opposite, 3:] = -b[opposite, 3:]
-    return a + share * (b - a), good
+    return a + share * (b - a), is_usable
 
 
 def _to_parent_frame(values: Floats, position: Floats) -> Floats:

@@ -35,7 +35,7 @@ USUAL_LATITUDE_DEG = 45.0
 LARGEST_FRAME = 20_000.0
 # m, least significant motion of positions, by GNSS and in a local frame. Judgement: a receiver at
 # rest drifts by many metres, SLAM and motion capture by centimetres
-GNSS_MOVES, LOCAL_MOVES = 20.0, 0.5
+MIN_GNSS_MOTION, MIN_LOCAL_MOTION = 20.0, 0.5
 # semi-major axis m, inverse flattening
 ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
               'Krassovsky': (6378245.0, 298.3)}
@@ -127,7 +127,7 @@ def C_en(latitude: ArrayLike, longitude: ArrayLike) -> Floats:
                      np.stack([zero, cp, sp], -1)], -2)
 
 
-def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, Floats]:
+def geodetic_from_local(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, Floats]:
     """
     Return latitude, longitude, rad, and height, m, from (n, 3) m in a local frame: (n,) each.
 
@@ -136,8 +136,8 @@ def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, 
     """
     latitude = math.radians(USUAL_LATITUDE_DEG if math.isnan(latitude_deg) else latitude_deg)
     with np.errstate(invalid='ignore'):      # a signalling NaN
-        near = np.all(np.abs(position) <= LARGEST_FRAME, axis=1)[:, None]
-    x, y, z = np.where(near, position, np.nan).T
+        in_range = np.all(np.abs(position) <= LARGEST_FRAME, axis=1)[:, None]
+    x, y, z = np.where(in_range, position, np.nan).T
     origin_e = ecef_from_geodetic(latitude, FRAME_LONGITUDE, 0.0)
     # no matrix product: its last bits depend on the number of rows, so replay would differ
     r_e = np.stack([origin + a * x + b * y + c * z for origin, (a, b, c) in zip(
@@ -152,8 +152,9 @@ def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
         n = len(stamps)
         kind = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
         covariance_n = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
-        return from_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
-                          covariance_n, kind, np.full(n, LOCAL_STATUS))
+        geodetic = geodetic_from_local(position, latitude_deg)
+        return from_columns(FixSamples, stamps, received, *geodetic, covariance_n, kind,
+                            np.full(n, LOCAL_STATUS))
     return build
 
 

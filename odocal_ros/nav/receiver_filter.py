@@ -2,14 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Errors of fixes by the filter of a receiver, described by one unknown ``square``, s^2.
+Errors of fixes by a filter or an odometer in the receiver, docs/method.md (S16) to (S16b).
 
-Above zero: the mean of past positions, weighted by exp(-age / tau) / tau, square = tau^2. The
-delay of a stamp is the mean age; this module computes the rest, the smoothed position at t + tau
-minus the position at t. Below zero: a filter of position and velocity, square = -2 tau^2, which
-follows a constant velocity without delay and overshoots where it changes. Its error e of the
-position p is e'' + sqrt(2) e' / tau + e / tau^2 = -p''. For small tau both are p'' square / 2, the
-first term of a series that converges slowly: at 0.6 s in town its next terms are decimetres.
+A receiver has one of two filters with the time constant tau, described by one unknown, lag_square:
+
+* lag_square = tau^2 > 0: the mean of past positions, weighted by exp(-age / tau) / tau. The delay
+  of a stamp is the mean age; this module computes the rest, the mean at t + tau minus the position
+  at t.
+* lag_square = -2 tau^2 < 0: a filter of position and velocity, which follows a constant velocity
+  without delay and overshoots where it changes. Its error e of the position p is
+  e'' + sqrt(2) e' / tau + e / tau^2 = -p''.
+
+For small tau both errors are p'' lag_square / 2, the first term of a series that converges slowly:
+at 0.6 s in town its next terms are decimetres.
 """
 
 import numpy as np
@@ -17,83 +22,84 @@ from scipy.linalg import solve_banded
 
 from odocal_ros.data.arrays import Floats, Ints
 
-# s^2, judgement: the error is proportional to ``square`` below
+# s^2, judgement: the error is proportional to ``lag_square`` below
 MIN_LAG2 = 1e-4
 
 
-def smoothing_error(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
-                    ) -> tuple[Floats, Floats]:
+def filter_error(t: Floats, position: Floats, velocity: Floats, times: Floats,
+                 lag_square: float) -> tuple[Floats, Floats]:
     """
-    Return the errors of filtered positions, (k, 3) m, and their derivatives by ``square``.
+    Return the errors of filtered positions, (k, 3) m, and their derivatives by ``lag_square``.
 
-    t, place, velocity : (n,) s, rising, (n, 3) m and m/s of the antenna, with cubics in between.
-    at : (k,) s, stamps minus the mean age of the content of a fix.   square : s^2, as above.
+    t, position, velocity : (n,) s, rising, (n, 3) m and m/s of the antenna, with cubics in
+    between.   times : (k,) s, stamps minus their delay.   lag_square : s^2, as above.
     """
-    def error(square: float) -> Floats:
-        if square > 0:
-            track, tau = _Track(t, place, velocity), np.sqrt(square)
-            return track.smoothed(at + tau, tau) - track.at(at)
-        return _tracking_error(t, place, velocity, at, np.sqrt(-square / 2))
+    def error(lag_square: float) -> Floats:
+        if lag_square > 0:
+            track, tau = _Track(t, position, velocity), np.sqrt(lag_square)
+            return track.smoothed(times + tau, tau) - track.at(times)
+        return _tracking_error(t, position, velocity, times, np.sqrt(-lag_square / 2))
 
-    if abs(square) <= MIN_LAG2:
-        small = -MIN_LAG2 if square < 0 else MIN_LAG2
+    if abs(lag_square) <= MIN_LAG2:
+        small = -MIN_LAG2 if lag_square < 0 else MIN_LAG2
         rate = error(small) / small
-        return rate * square, rate
-    value = error(square)
+        return rate * lag_square, rate
+    value = error(lag_square)
     lag2_step = 1e-4    # relative, of the difference that gives a derivative
-    return value, (error(square * (1 + lag2_step)) - value) / (square * lag2_step)
+    return value, (error(lag_square * (1 + lag2_step)) - value) / (lag_square * lag2_step)
 
 
-def _cubic_coefficients(t: Floats, place: Floats, velocity: Floats) -> tuple[Floats, Floats,
-                                                                             Floats]:
+def _cubic_coefficients(t: Floats, position: Floats,
+                        velocity: Floats) -> tuple[Floats, Floats, Floats]:
     """Return (n - 1, 1) lengths of the intervals, (n - 1, 3) p'' / 2 at their start, p''' / 6."""
     T = np.diff(t)[:, None]
-    mean = np.diff(place, axis=0) / T
+    mean = np.diff(position, axis=0) / T
     return (T, (3 * mean - 2 * velocity[:-1] - velocity[1:]) / T,
             (velocity[:-1] + velocity[1:] - 2 * mean) / T**2)
 
 
-def own_odometer_error(t: Floats, place: Floats, velocity: Floats, at: Floats, share: float,
-                       log_time: float) -> tuple[Floats, Floats, Floats]:
+def odometer_error(t: Floats, position: Floats, velocity: Floats, times: Floats,
+                   scale_error: float, log_time: float) -> tuple[Floats, Floats, Floats]:
     """
-    Return fix errors from the receiver's own odometer, and derivatives by share and log_time.
+    Return the errors of fixes by an odometer in the receiver, (k, 3) m, (S16a).
 
-    The error is ``share`` times the motion until ``at``, weighted by exp(-age / time): satellites
-    correct the position of its odometer within that time.
+    Also their derivatives by ``scale_error`` and ``log_time``. The error is the scale error times
+    the motion before each time, weighted by exp(-age / time): satellites correct the position
+    within ``time``.
 
-    t, place, velocity, at : as for ``smoothing_error``.   share : relative scale error of its
-    odometer.   log_time : logarithm of s.
+    t, position, velocity, times : as for ``filter_error``.   scale_error : relative.   log_time :
+    logarithm of the time, s.
     """
-    track, time, step = _Track(t, place, velocity), np.exp(log_time), 1e-3    # of the logarithm
-    motion = track.at(at) - track.smoothed(at, time)
-    longer = track.at(at) - track.smoothed(at, time * np.exp(step))
-    return share * motion, motion, share * (longer - motion) / step
+    track, time, step = _Track(t, position, velocity), np.exp(log_time), 1e-3    # of the logarithm
+    motion = track.at(times) - track.smoothed(times, time)
+    longer = track.at(times) - track.smoothed(times, time * np.exp(step))
+    return scale_error * motion, motion, scale_error * (longer - motion) / step
 
 
 class _Track:
     """Cubics between positions and velocities, extrapolated linearly, and means of their past."""
 
-    def __init__(self, t: Floats, place: Floats, velocity: Floats) -> None:
+    def __init__(self, t: Floats, position: Floats, velocity: Floats) -> None:
         extrapolation = 10.0       # s of extrapolation at the last velocity
         self.t = np.append(t, t[-1] + extrapolation)
-        self.place = np.concatenate([place, place[-1:] + extrapolation * velocity[-1:]])
+        self.position = np.concatenate([position, position[-1:] + extrapolation * velocity[-1:]])
         self.velocity = np.concatenate([velocity, velocity[-1:]])
-        self.T, self.bend, self.twist = _cubic_coefficients(self.t, self.place, self.velocity)
+        self.T, self.bend, self.twist = _cubic_coefficients(self.t, self.position, self.velocity)
 
-    def _cubic(self, at: Floats) -> tuple[Ints, Floats, Floats]:
+    def _cubic(self, times: Floats) -> tuple[Ints, Floats, Floats]:
         """Return intervals (k,), times in them (k, 1) and positions (k, 3)."""
-        k = np.clip(np.searchsorted(self.t, at, side='right') - 1, 0, len(self.T) - 1)
-        s = (at - self.t[k])[:, None]
-        return k, s, self.place[k] + s * (
+        k = np.clip(np.searchsorted(self.t, times, side='right') - 1, 0, len(self.T) - 1)
+        s = (times - self.t[k])[:, None]
+        return k, s, self.position[k] + s * (
             self.velocity[k] + s * (self.bend[k] + s * self.twist[k]))
 
-    def at(self, at: Floats) -> Floats:
-        """Return the positions at ``at``, (k, 3)."""
-        return self._cubic(at)[2]
+    def at(self, times: Floats) -> Floats:
+        """Return the positions, (k, 3)."""
+        return self._cubic(times)[2]
 
-    def smoothed(self, at: Floats, tau: float) -> Floats:
+    def smoothed(self, times: Floats, tau: float) -> Floats:
         """
-        Return the mean of the positions before ``at``, weighted by exp(-age / tau), (k, 3).
+        Return the mean of the positions before each time, weighted by exp(-age / tau), (k, 3).
 
         On a cubic it is the cubic p - tau p' + tau^2 p'' - tau^3 p''' plus a decaying transient.
         """
@@ -104,16 +110,17 @@ class _Track:
         decay = np.append(-np.exp(-T[:-1, 0] / tau), 0.0)
         transient = solve_banded((1, 0), np.stack([np.ones_like(decay), decay]),
                                  np.concatenate([-first[:1], last[:-1] - first[1:]]))
-        k, s, p = self._cubic(at)
+        k, s, p = self._cubic(times)
         rate = self.velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
         steady = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
         mean: Floats = steady + transient[k] * np.exp(-np.maximum(s, 0.0) / tau)
         return mean
 
 
-def _tracking_error(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
-    """Return the error at ``at`` of a filter of position and velocity, (k, 3)."""
-    T, bend, twist = _cubic_coefficients(t, place, velocity)
+def _tracking_error(t: Floats, position: Floats, velocity: Floats, times: Floats,
+                    tau: float) -> Floats:
+    """Return the errors of a filter of position and velocity, (k, 3)."""
+    T, bend, twist = _cubic_coefficients(t, position, velocity)
 
     def forced_response(k: Ints | slice, s: Floats) -> Floats:
         """Return error and derivative on cubics k at times s in them, without transients."""
@@ -126,8 +133,8 @@ def _tracking_error(t: Floats, place: Floats, velocity: Floats, at: Floats, tau:
     transient[1:] += last[:-1]       # error and derivative are continuous where two cubics meet
     for m in range(1, len(T)):
         transient[m] += transition[m] @ transient[m - 1]
-    k = np.clip(np.searchsorted(t, at, side='right') - 1, 0, len(T) - 1)
-    s = (at - t[k])[:, None]
+    k = np.clip(np.searchsorted(t, times, side='right') - 1, 0, len(T) - 1)
+    s = (times - t[k])[:, None]
     error: Floats = forced_response(k, s)[:, 0] + np.einsum(
         'ki,kij->kj', _transition_matrices(np.maximum(s[:, 0], 0.0), tau)[:, 0], transient[k])
     return error

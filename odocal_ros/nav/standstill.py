@@ -4,7 +4,8 @@
 """
 Detection of standstills, from which alignment, gyro bias and legs start.
 
-In: turn rates and the travel of the odometer. Out: intervals in which neither shows motion.
+A standstill is an interval in which neither the turn rates nor the travel of the odometer show
+motion. The detector divides the time into cells, and tests a window around each.
 """
 
 from functools import reduce
@@ -15,9 +16,9 @@ from odocal_ros.data.arrays import Bools, Floats, map_windows, reduce_columns, r
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import integral_at
 
-REST_GRID = 0.1       # s, judgement: grid of the detector
-REST_WINDOW = 0.5     # s, judgement: each side
-REST_TRAVEL = 0.03    # m, judgement: largest travel in the window at rest
+REST_CELL = 0.1       # s, judgement: length of a cell of the detector
+REST_WINDOW = 0.5     # s, judgement: reach of the window of a cell to each side
+REST_TRAVEL = 0.03    # m, judgement: largest travel in a window at rest
 REST_TURN = 0.02      # rad/s, judgement: largest drift of the gyro at rest
 MAX_BIAS = 0.12      # rad/s, each axis, physical: largest bias of a gyro (cheap phones: 0.1)
 
@@ -36,11 +37,11 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     t0, t1 = max(t_imu[0], travel.t[0]), min(t_imu[-1], travel.t[-1])
     if t1 - t0 < shortest:
         return np.empty((0, 2))
-    edges = np.linspace(t0, t1, max(2, round((t1 - t0) / REST_GRID)) + 1)
+    edges = np.linspace(t0, t1, max(2, round((t1 - t0) / REST_CELL)) + 1)
     middle = (edges[:-1] + edges[1:]) / 2
     rate, steady = _steady_rates(edges, t_imu, w_b)
-    at_rest = _still_wheels(middle, travel, metres_per_unit) & steady
-    at_rest &= _not_turning(rate, at_rest, edges, shortest)
+    at_rest = _wheels_at_rest(middle, travel, metres_per_unit) & steady
+    at_rest &= _has_lowest_rate(rate, at_rest, edges, shortest)
     spans = _spans(at_rest, edges, shortest)
     path = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
     speed_limit = 0.02    # m/s, largest mean speed of a long standstill
@@ -62,19 +63,19 @@ def _spans(at_rest: Bools, edges: Floats, shortest: float) -> Floats:
     return spans[spans[:, 1] - spans[:, 0] >= shortest - 1e-9]
 
 
-def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
+def _wheels_at_rest(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
     """Return a mask of cells with little travel around their middles: (m,)."""
     # range of the travel at a few times in the window, so that rocking is detected
     probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
     distance = np.max(probes, axis=0) - np.min(probes, axis=0)
-    is_still: Bools = distance * metres_per_unit <= _travel_limit(travel, metres_per_unit)
-    return is_still
+    at_rest: Bools = distance * metres_per_unit <= _travel_limit(travel, metres_per_unit)
+    return at_rest
 
 
 def _steady_rates(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
     """Return the mean turn rate around each cell, (m, 3), and a mask of scatter < REST_TURN."""
     rate = np.diff(integral_at(edges, t_imu, w_b), axis=0) / np.diff(edges)[:, None]
-    reach = round(REST_WINDOW / REST_GRID)
+    reach = round(REST_WINDOW / REST_CELL)
     padded = np.pad(rate, ((reach, reach), (0, 0)), mode='edge')
     shifted = [padded[k:k + len(rate)] for k in range(2 * reach + 1)]
     mean = reduce(np.add, shifted) / len(shifted)
@@ -87,7 +88,7 @@ def _steady_rates(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bo
     return mean, reduce_columns(np.logical_and, scatter < REST_TURN) & has_data
 
 
-def _not_turning(rate: Floats, at_rest: Bools, edges: Floats, shortest: float) -> Bools:
+def _has_lowest_rate(rate: Floats, at_rest: Bools, edges: Floats, shortest: float) -> Bools:
     """Return a mask of cells with the lowest steady turn rate, which is the bias at rest."""
     medians = [np.median(rate[(edges[:-1] >= a) & (edges[1:] <= b)], axis=0)
                for a, b in _spans(at_rest, edges, shortest)]

@@ -7,8 +7,6 @@ Time series: integrals, gaps in the times of rows, sigmas and lines by medians.
 Integrals of long columns are computed in pieces, bitwise equal to integrals at once.
 """
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,68 +18,40 @@ MISSING_INTERVALS = 2.5  # judgement: median intervals, a message or more is mis
 GAP_INTERVALS = 5.0      # judgement: median intervals, a longer step is a gap
 
 
-class Integral:
-    """The integral of (n, ...) by the trapezoid rule, over consecutive pieces."""
-
-    def __init__(self) -> None:
-        self.end = 0.0
-
-    def over(self, t: Floats, x: Floats) -> Floats:
-        """Return the integral at a piece's rows; its first row is the last of the one before."""
-        out = np.empty_like(x)
-        out[0] = self.end
-        np.multiply((x[:-1] + x[1:]) / 2, np.diff(t).reshape(-1, *(1,) * (x.ndim - 1)),
-                    out=out[1:])
-        np.cumsum(out, axis=0, out=out)
-        self.end = out[-1].copy()
-        return out
-
-
-def running_integral(t: Floats, x: Floats) -> Floats:
-    """Return the integral of x, (n, ...), from t[0] to each row, linear between rows."""
-    return Integral().over(t, x)
+def running_integral(t: Floats, x: Floats, start: float | Floats = 0.0) -> Floats:
+    """Return ``start`` plus the integral of x, (n, ...), up to each row by the trapezoid rule."""
+    out = np.empty_like(x)
+    out[0] = start
+    np.multiply((x[:-1] + x[1:]) / 2, np.diff(t).reshape(-1, *(1,) * (x.ndim - 1)), out=out[1:])
+    return np.cumsum(out, axis=0, out=out)
 
 
 def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     """Return the integral of x, (n, ...), from t[0] to rising times (m,): (m, ...)."""
-    return integrals_at([times], t, x)[0]
+    out, end = np.empty((len(times), *x.shape[1:])), 0.0
+    for some, rows in enclosing_slices(times, t):
+        integral = running_integral(t[rows], x[rows], end)
+        end = integral[-1]
+        out[some] = interpolated(times[some], t[rows], integral)
+    return out
 
 
-def integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Floats]:
-    """Return ``integral_at`` for each of several arrays of times."""
-    return _at(times, t, x, Integral().over)
+def double_integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
+    """Return the integral of the integral of x, (n,), at rising times: (m,)."""
+    out, end, double_end = np.empty(len(times)), 0.0, 0.0
+    for some, rows in enclosing_slices(times, t):
+        integral = running_integral(t[rows], x[rows], end)
+        double = running_integral(t[rows], integral, double_end)
+        end, double_end = integral[-1], double[-1]
+        out[some] = interpolated(times[some], t[rows], double)
+    return out
 
 
-def twice_integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
-    """Return the integral of the integral of x, (n,), at times, rising: (m,)."""
-    return twice_integrals_at([times], t, x)[0]
-
-
-def twice_integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Floats]:
-    """Return ``twice_integral_at`` for each of several arrays of times."""
-    once, twice = Integral(), Integral()
-    return _at(times, t, x, lambda t, x: twice.over(t, once.over(t, x)))
-
-
-def _at(times: Sequence[Floats], t: Floats, x: Floats,
-        over: Callable[[Floats, Floats], Floats]) -> list[Floats]:
-    """Return an integral of x at times; over : integral at the rows of consecutive pieces."""
-    integrals = [np.empty((len(each), *x.shape[1:])) for each in times]
-    for parts in zip(*(enclosing_slices(each, t) for each in times), strict=True):
-        rows = parts[0][1]
-        integral = over(t[rows], x[rows])
-        for each, (where, _), out in zip(times, parts, integrals, strict=True):
-            interpolated(each[where], t[rows], integral, out[where])
-    return integrals
-
-
-def interpolated(times: Floats, t: Floats, x: Floats, out: Floats) -> None:
-    """Write x, (n,) or (n, k), at times to out, linear between rows."""
+def interpolated(times: Floats, t: Floats, x: Floats) -> Floats:
+    """Return x, (n,) or (n, k), at times, linear between rows, constant outside."""
     if x.ndim == 1:
-        out[:] = np.interp(times, t, x)
-        return
-    for k in range(x.shape[1]):
-        out[:, k] = np.interp(times, t, x[:, k])
+        return np.interp(times, t, x)
+    return np.stack([np.interp(times, t, column) for column in x.T], -1)
 
 
 def robust_sigma(residual: NDArray[np.float64]) -> float:

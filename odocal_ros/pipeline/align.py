@@ -18,9 +18,9 @@ from odocal_ros.nav.alignment import (
     earth_rate_deviation,
     gyrocompass,
     HEADING_LIMIT,
-    Level,
     level_at_rest,
     level_in_motion,
+    LevelAttitude,
     make_alignment,
     MOTION_LEVEL,
     REST_EDGE,
@@ -106,7 +106,8 @@ def _enu_to_n_at(inputs: Inputs, span: Floats | tuple[float, float] | None, fixe
 
 
 def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude: float,
-                    grade: nominal.Grade, gyro_noise: float) -> tuple[Level, tuple[Reason, ...]]:
+                    grade: nominal.Grade, gyro_noise: float,
+                    ) -> tuple[LevelAttitude, tuple[Reason, ...]]:
     """Return the level at a standstill, or at the start of the drive without one, and reasons."""
     if span is not None:
         return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, gyro_noise), ()
@@ -150,7 +151,7 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
             for name, x in signals.items() if inputs.has_accelerometer or name == 'gyro'}
 
 
-def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
+def _select_heading(inputs: Inputs, level: LevelAttitude, latitude: float, grade: nominal.Grade,
                     config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
     """
     Return the heading by the first source that has one, and the reasons of those that do not.
@@ -172,7 +173,7 @@ def _select_heading(inputs: Inputs, level: Level, latitude: float, grade: nomina
     return 0.0, np.pi, 'course', True, tuple(refusals) if setting != 'auto' else ()
 
 
-def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: float,
+def _heading_from_source(source: str, inputs: Inputs, level: LevelAttitude, latitude: float,
                          grade: nominal.Grade, config: Config) -> HeadingOrRefusal:
     """Return yaw and sigma of the x axis of L by one source."""
     if source == 'heading_topic':
@@ -187,7 +188,7 @@ def _heading_from_source(source: str, inputs: Inputs, level: Level, latitude: fl
     return _heading_by_gyrocompass(inputs, level, latitude, grade, config)
 
 
-def _configured_heading(inputs: Inputs, level: Level, config: Config) -> HeadingOrRefusal:
+def _configured_heading(inputs: Inputs, level: LevelAttitude, config: Config) -> HeadingOrRefusal:
     """Return yaw and sigma at the level's epoch by ``alignment.heading``, which is at the mark."""
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
@@ -198,7 +199,7 @@ def _configured_heading(inputs: Inputs, level: Level, config: Config) -> Heading
     return (float(rotations.wrap(mark_yaw - turn)), config.alignment.heading_sigma), ''
 
 
-def _turn_since(inputs: Inputs, level: Level) -> float:
+def _turn_since(inputs: Inputs, level: LevelAttitude) -> float:
     """Return the turn from the epoch of a level to the start mark, rad."""
     rows = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
     if rows.sum() < 2:
@@ -209,8 +210,9 @@ def _turn_since(inputs: Inputs, level: Level) -> float:
     return float(np.arctan2(C[1, 0], C[0, 0]))
 
 
-def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Floats, level: Level,
-                               config: Config, offset: float = 0.0) -> HeadingOrRefusal:
+def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Floats,
+                               level: LevelAttitude, config: Config, offset: float = 0.0,
+                               ) -> HeadingOrRefusal:
     """Return (yaw, sigma) at the level's epoch from published orientations, or None, reason."""
     heading_reach = 0.5    # s, largest distance of a heading sample from a start in motion
     # a leg may have hours of rows: select the used ones first
@@ -233,8 +235,8 @@ def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Flo
     return (float(rotations.wrap(yaw)), float(sigma)), ''
 
 
-def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: nominal.Grade,
-                            config: Config) -> HeadingOrRefusal:
+def _heading_by_gyrocompass(inputs: Inputs, level: LevelAttitude, latitude: float,
+                            grade: nominal.Grade, config: Config) -> HeadingOrRefusal:
     """Return yaw and sigma by the Earth rate at a standstill."""
     if inputs.is_local:
         return None, 'the positions are in a local frame, whose y axis does not point to north'
@@ -254,8 +256,8 @@ def _heading_by_gyrocompass(inputs: Inputs, level: Level, latitude: float, grade
     return (yaw, sigma), ''
 
 
-def _heading_by_course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats,
-                       origin: Origin, grade: nominal.Grade,
+def _heading_by_course(inputs: Inputs, level: LevelAttitude, metres_per_unit: float,
+                       fixes_n: Floats, origin: Origin, grade: nominal.Grade,
                        ) -> tuple[float, float, tuple[Reason, ...]]:
     """Return the yaw that rotates the first 30 m of track onto the fixes, its sigma, reasons."""
     trial = make_alignment(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)

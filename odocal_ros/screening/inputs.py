@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, medians
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
-from odocal_ros.nav.geodesy import ecef_from_geodetic, GNSS_MOVES, LOCAL_MOVES, rate_without_north
+from odocal_ros.nav.geodesy import (
+    ecef_from_geodetic,
+    MIN_GNSS_MOTION,
+    MIN_LOCAL_MOTION,
+    rate_without_north,
+)
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.settings.config import Config
@@ -71,7 +76,7 @@ class Inputs:
     @property
     def min_motion(self) -> float:
         """Return the minimum distance between positions that is certainly motion, m."""
-        return LOCAL_MOVES if self.is_local else GNSS_MOVES
+        return MIN_LOCAL_MOTION if self.is_local else MIN_GNSS_MOTION
 
     def standstills(self, metres_per_unit: float, config: Config) -> Floats:
         """Return the standstills of ``leg.standstill`` or longer, begin and end: (k, 2) s."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints, runs
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.time_series import integral_at, integrals_at, twice_integrals_at
+from odocal_ros.nav.time_series import double_integral_at, integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS
 from odocal_ros.settings.nominal import G
@@ -144,8 +144,8 @@ class _Forces:
     def __init__(self, t: Floats, t_imu: Floats, w_b: Floats, f_b: Floats) -> None:
         self.angle = integral_at(t, t_imu, w_b)
         times = [t + delay for delay in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME)]
-        self.speed_before, self.speed = integrals_at(times[:2], t_imu, f_b)
-        before, middle, after = twice_integrals_at(times, t_imu, f_b[:, 0])
+        self.speed_before, self.speed = (integral_at(x, t_imu, f_b) for x in times[:2])
+        before, middle, after = (double_integral_at(x, t_imu, f_b[:, 0]) for x in times)
         self.along = (before - 2 * middle + after) / ACCELERATION_TIME**2
 
 

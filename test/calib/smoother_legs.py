@@ -76,7 +76,7 @@ def truth(drive, config, leg) -> layout.State:
     """Return the true state at the keyframes of a leg, on level ground."""
     o = drive.options
     imu = make_problem(leg, config).imu
-    t = imu.t[imu.key]
+    t = imu.t_keyframes
     since = t + (drive.truth.start_ns - o.start_ns) * 1e-9
     state = drive.motion.at(since)
     to_n = C_en(leg.origin.latitude, leg.origin.longitude).T @ C_en(state.latitude,

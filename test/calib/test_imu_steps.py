@@ -46,7 +46,7 @@ def integrals(T, terms=12):
 
 def summed(leg, t_points=(), constants=None):
     imu = ImuSteps.from_leg(leg, 1.0)
-    K = len(imu.key) - 1
+    K = len(imu.keyframes) - 1
     return imu, *preintegrate(imu, np.tile(BIAS, (K, 1)), np.tile(FORCE_BIAS, (K, 1)),
                               lambda t: SPEED * t, np.array([1.0, 0.0, 0.0]),
                               np.array(t_points), constants)
@@ -66,7 +66,7 @@ def test_constant_turn_equals_its_closed_form(rate):
         np.testing.assert_allclose((sums.A[k], sums.AA[k]), (A, AA), atol=loose)
     for k, tau, dv, dp, R in zip(points.interval, points.tau, points.dv, points.dp, points.R,
                                  strict=True):
-        assert imu.t[imu.key[k]] + tau == pytest.approx((1.23, 3.91)[int(k > 1)])
+        assert imu.t_keyframes[k] + tau == pytest.approx((1.23, 3.91)[int(k > 1)])
         want = integrals(tau)
         np.testing.assert_allclose(R, want[0], atol=BENT)
         # the force is linear within a step; its curvature is 0.6^2 T^2 / 12 of it
@@ -133,7 +133,7 @@ def test_steps_last_a_tenth_of_a_second_and_end_at_keyframes_except_in_gaps():
     t = np.arange(0.0, 4.001, 0.01)
     imu = ImuSteps.from_leg(turning(t), 1.0)
     np.testing.assert_allclose(np.diff(imu.t), STEP, atol=1e-9)
-    np.testing.assert_allclose(imu.t[imu.key], np.arange(5.0), atol=1e-9)
+    np.testing.assert_allclose(imu.t_keyframes, np.arange(5.0), atol=1e-9)
     np.testing.assert_allclose(imu.longest, 0.01, atol=1e-9)
     imu = ImuSteps.from_leg(turning(t[(t < 1.33) | (t > 1.78)]), 1.0)
     k = int(np.argmax(imu.longest))
@@ -153,7 +153,7 @@ def test_chunks_of_any_size_give_the_same_sums(monkeypatch):
     monkeypatch.setattr('odocal_ros.estimator.imu.SAMPLES_IN_CACHE', 33)
     monkeypatch.setattr('odocal_ros.estimator.imu.KEYFRAMES_IN_CACHE', 3)
     parts = ImuSteps.from_leg(leg, 1.0)
-    for name in ('turn', 'turn_mean', 'dv', 'dp', 'signals', 'longest', 't', 'key'):
+    for name in ('turn', 'turn_mean', 'dv', 'dp', 'signals', 'longest', 't', 'keyframes'):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-12)
 
 

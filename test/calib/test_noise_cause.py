@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import AS_SENT
-from odocal_ros.estimator.result.mismatch import find_noise_cause, find_quantised
+from odocal_ros.estimator.result.mismatch import find_noise_cause, find_quantisation_steps
 from odocal_ros.estimator.result.odometry_output import twist_noise
 from odocal_ros.estimator.several import _disagreement_reasons
 from odocal_ros.pipeline.calibrate import calibrate
@@ -30,7 +30,7 @@ def leg(step_w, step_f, noise=0.5, n=20_000):
 
 def test_quantisation_step_of_a_signal_is_found_or_zero():
     without_noise = {'gyro': 0.0, 'accel': 0.0}       # any step explains zero noise
-    assert find_quantised(leg(np.deg2rad(0.25), 0.0), without_noise) == {
+    assert find_quantisation_steps(leg(np.deg2rad(0.25), 0.0), without_noise) == {
         'gyro': pytest.approx(np.deg2rad(0.25), rel=0.01)}
 
 
@@ -38,16 +38,16 @@ def test_quantisation_explains_only_noise_of_its_size():
     step = 0.125
     white = step * np.sqrt(1 / 12 / RATE)        # closed form of rounding
     coarse = leg(0.0, step)
-    assert find_quantised(coarse, {'gyro': 1.0, 'accel': 1.4 * white}) == {
+    assert find_quantisation_steps(coarse, {'gyro': 1.0, 'accel': 1.4 * white}) == {
         'accel': pytest.approx(step, rel=0.01)}
-    assert find_quantised(coarse, {'gyro': 1.0, 'accel': 2.0 * white}) == {}
+    assert find_quantisation_steps(coarse, {'gyro': 1.0, 'accel': 2.0 * white}) == {}
 
 
 def problem(leg, rest):
     """Return the input of the cause search; rest: s of standstill before the drive."""
     keys = np.arange(0.0, leg.t_imu[-1], 1.0)
     return SimpleNamespace(leg=leg, at_rest=keys < rest,
-                           imu=SimpleNamespace(t=keys, key=np.arange(len(keys))))
+                           imu=SimpleNamespace(t_keyframes=keys))
 
 
 def noisy(moving, rest, rest_s=60.0, n=20_000):

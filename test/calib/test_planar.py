@@ -18,7 +18,12 @@ from odocal_ros.calib.planar.run import (
     wheel_rows,
     Wheels,
 )
-from odocal_ros.estimator.result.wheels import _leave_one_out, _solve, fit_line, Increments
+from odocal_ros.estimator.result.wheel_regression import (
+    _leave_one_out,
+    _solve,
+    fit_regression,
+    Increments,
+)
 
 LEFT, RIGHT, WIDTH = 0.0352, 0.0349, 0.31     # m/rad, m
 SCALES = np.array([0.0352, 0.0349, 0.0351, 0.0356])     # m/rad, of each wheel
@@ -217,7 +222,7 @@ def dense(seen, spread, log_levels):
     """Return the full covariance of increments from readings and random walk."""
     k = len(seen.y)
     D = np.diff(np.eye(k + 1), axis=0)
-    walk = (seen.walk * np.exp(log_levels[:-1]))[seen.kind] * seen.share * spread
+    walk = (seen.walk * np.exp(log_levels[:-1]))[seen.kind] * seen.walk_time * spread
     return np.diag(walk) + seen.reading * np.exp(log_levels[-1]) * D @ D.T
 
 
@@ -241,7 +246,7 @@ def test_fit_equals_least_squares_with_the_full_covariance():
 
 
 def test_ratio_with_a_random_walk_only_is_that_of_the_end_points():
-    line = fit_line(seen := increments(walk=1e-3**2))
+    line = fit_regression(seen := increments(walk=1e-3**2))
     assert line.x[0] == pytest.approx(seen.y.sum() / seen.X.sum(), rel=1e-6)
     # the logarithm of a variance from k increments has sigma sqrt(2 / k); the prior is far wider
     level, = line.levels
@@ -253,7 +258,7 @@ def test_ratio_with_a_random_walk_only_is_that_of_the_end_points():
     (1e-3**2, 0.0), (0.0, 0.01**2), (1e-3**2, 0.01**2), (0.02**2, 1e-3**2)])
 def test_sigmas_hold_for_walk_and_reading_errors(walk, reading):
     """40 drives: their rms has an error of 1 / sqrt(80), four times that is 0.45."""
-    lines = [fit_line(increments(seed, walk, reading)) for seed in range(40)]
+    lines = [fit_regression(increments(seed, walk, reading)) for seed in range(40)]
     off = np.array([(line.x[0] - 1e-3) / np.sqrt(line.covariance[0, 0]) for line in lines])
     assert np.sqrt((off**2).mean()) == pytest.approx(1.0, abs=0.45)
 
@@ -267,14 +272,14 @@ def test_each_kind_has_a_separate_walk_level():
                    y=1e-3 * PATH + np.sqrt(walk[kind]) * draw.standard_normal(900))
     # each from 300 increments; the common prior has a sigma of 1 and moves them by (2 / 300)
     # of their distance from the mean, which is 2.2 at most
-    assert np.abs(np.log(fit_line(seen).levels / walk)).max() < 4 * np.sqrt(2 / 300) + 0.02
+    assert np.abs(np.log(fit_regression(seen).levels / walk)).max() < 4 * np.sqrt(2 / 300) + 0.02
 
 
 def test_outlying_increments_have_less_weight():
     seen = increments()
     jumps = np.zeros(K)
     jumps[[50, 120, 200]] = 0.3, 0.2, -0.1       # m, with a walk of 1 mm
-    line, clean = fit_line(replace(seen, y=seen.y + jumps)), fit_line(seen)
+    line, clean = fit_regression(replace(seen, y=seen.y + jumps)), fit_regression(seen)
     sigma = np.sqrt(clean.covariance[0, 0])
     # with full weight 0.4 m in 3000 m, 2300 sigma
     assert abs(line.x[0] - clean.x[0]) < 2 * sigma
@@ -283,18 +288,18 @@ def test_outlying_increments_have_less_weight():
 
 def test_increment_with_a_very_large_sigma_has_no_effect():
     seen = increments(reading=1e-3**2)
-    share, y = seen.share.copy(), seen.y.copy()
-    share[100:103], y[100:103] = 1e10, 5.0
-    line, clean = fit_line(replace(seen, share=share, y=y)), fit_line(seen)
+    walk_time, y = seen.walk_time.copy(), seen.y.copy()
+    walk_time[100:103], y[100:103] = 1e10, 5.0
+    line, clean = fit_regression(replace(seen, walk_time=walk_time, y=y)), fit_regression(seen)
     assert abs(line.x[0] - clean.x[0]) < np.sqrt(clean.covariance[0, 0])
 
 
 def test_gain_maps_increments_to_x_and_mirrored_wheels_have_negative_x():
     """Increments proportional to X return x unchanged, without a prior."""
     seen = increments(reading=1e-3**2)
-    line = fit_line(seen)
+    line = fit_regression(seen)
     assert_allclose(line.gain @ seen.X, np.eye(1), rtol=1e-9)
     assert line.gain @ seen.y == pytest.approx(line.x, rel=1e-9)
-    other = fit_line(replace(seen, y=-seen.y))
+    other = fit_regression(replace(seen, y=-seen.y))
     assert_allclose(other.x, -line.x, rtol=1e-12)
     assert_allclose(other.covariance, line.covariance, rtol=1e-12)

@@ -89,7 +89,7 @@ def stepping(moved):
 
 def without_steps(problem, state):
     """Return the problem with a travel whose speed is the state's at the keyframes."""
-    wheel = Axle(problem, state).wheel / state.scale
+    wheel = Axle(problem, state).wheel_speed / state.scale
     s = np.append(0.0, np.cumsum(np.diff(state.t) * (wheel[1:] + wheel[:-1]) / 2))
     fine = np.arange(state.t[0] - 0.1, state.t[-1] + 0.1, 1e-3)
     path = Travel(fine, CubicHermiteSpline(state.t, s, wheel)(fine), 0.0)

@@ -118,13 +118,13 @@ def test_leg_with_turns_determines_the_sideways_noise():
     # wheels that never slide: far below the level of a road; up has the level of springs and road
     noise = method.details['noise']
     assert max(noise['side'], noise['side_turn']) < interval_noise.ORDINARY_ROAD / 10
-    assert method.details['noise']['up'] == pytest.approx(interval_noise.HEAVE)
+    assert method.details['noise']['up'] == pytest.approx(interval_noise.MIN_VERTICAL_NOISE)
 
 
 def test_total_turn_is_that_of_the_drive_for_any_gyro_bias():
     drive, config, leg = made(duration=200.0, imu_grade='industrial')
     problem = make_problem(leg, config)
-    t = problem.imu.t[problem.imu.key] + (drive.truth.start_ns - drive.options.start_ns) * 1e-9
+    t = problem.imu.t_keyframes + (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     yaw = np.abs(np.diff(drive.motion.at(t).yaw))
     # slower than TURNING between turns: less than that rate at all times
     turn = interval_noise.total_turn(leg, problem.imu)
@@ -139,9 +139,9 @@ def test_lower_limit_falls_continuously_from_road_noise_to_that_of_turns():
     angles = np.deg2rad(np.arange(0.0, 270.0))
     least = np.array([interval_noise.min_sideslip(a) for a in angles])
     assert least[:90] == pytest.approx(interval_noise.ORDINARY_ROAD)
-    assert least[181:] == pytest.approx(interval_noise.TURN_SLIDE)
+    assert least[181:] == pytest.approx(interval_noise.MIN_TURN_SIDESLIP)
     # a factor of 80 over 90 deg: 5 % per degree
-    by_90 = np.log(interval_noise.ORDINARY_ROAD / interval_noise.TURN_SLIDE)
+    by_90 = np.log(interval_noise.ORDINARY_ROAD / interval_noise.MIN_TURN_SIDESLIP)
     assert np.abs(np.diff(np.log(least))).max() < by_90 / 90 * 1.001
 
 

@@ -101,7 +101,7 @@ def test_tyres_and_springs_depend_on_the_axle_acceleration_for_any_imu_position(
     for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
         _, problem, state = at_truth(imu_lever_arm=arm)
         signals = Equations(problem, state).factors['motion'].motion.lean_accelerations[:, :2]
-        found.append((signals, Axle(problem, state).acceleration(), problem))
+        found.append((signals, Axle(problem, state).traction_acceleration(), problem))
     (at_axle, along, problem), (elsewhere, along_elsewhere, _) = found
     change = np.abs(np.diff(problem.rate_b[:, 2])).max()
     assert change > 0.15
@@ -169,7 +169,7 @@ def test_tyre_force_on_a_slope_equals_that_of_the_same_acceleration():
     fast = there.speed > 2.0
     want = there.acceleration + G * there.slope
     # means over 1 s of an acceleration that changes by up to 1 m/s^3
-    assert np.abs(motion.axle.acceleration() - want)[fast].max() < 0.3
+    assert np.abs(motion.axle.traction_acceleration() - want)[fast].max() < 0.3
     assert np.ptp(G * there.slope[fast]) > 0.5
     # here the body axes are those of the road
     assert np.abs(motion.lean_accelerations[:, 0] - want)[fast].max() < 0.3

@@ -15,7 +15,7 @@ from odocal_ros.estimator import smooth
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors import signals
 from odocal_ros.estimator.factors.gnss import Fixes
-from odocal_ros.estimator.factors.interval_noise import REST_NOISE, rest_noise
+from odocal_ros.estimator.factors.interval_noise import MIN_REST_NOISE, rest_noise
 from odocal_ros.estimator.factors.motion import D, PHI, V
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer import standstill_weights
@@ -63,8 +63,8 @@ def test_noise_at_rest_is_measured_in_standstills():
     rest = np.arange(200) >= 100
     # 5 sigma of a variance from a hundred draws
     assert rest_noise(path, rest) == pytest.approx(0.0158**2, rel=5 * np.sqrt(2 / 100))
-    assert rest_noise(path, rest & (np.arange(200) < 103)) == REST_NOISE**2
-    assert rest_noise(np.zeros(200), rest) == REST_NOISE**2
+    assert rest_noise(path, rest & (np.arange(200) < 103)) == MIN_REST_NOISE**2
+    assert rest_noise(np.zeros(200), rest) == MIN_REST_NOISE**2
 
 
 @pytest.mark.parametrize(('loaded_s', 'most'), [(0, 1.2), (10, 2.0)])
@@ -73,7 +73,7 @@ def test_van_that_rocks_at_its_stops_has_no_noisy_accelerometer(loaded_s, most):
     rng = np.random.default_rng(4)
     signals = 1e-3 * rng.standard_normal((400, 6))
     signals[np.arange(400) % 40 < loaded_s, 5] += 0.03 * rng.standard_normal(10 * loaded_s)
-    imu = SimpleNamespace(t=np.arange(401.0), key=np.arange(401), signals=None,
+    imu = SimpleNamespace(t=np.arange(401.0), t_keyframes=np.arange(401.0), signals=None,
                           over_intervals=lambda _: signals)
     still = np.arange(401) % 40 <= 20
     sigma = white_noise_at_rest(imu, SimpleNamespace(has_accelerometer=True), still)['accel']**0.5

@@ -221,7 +221,7 @@ def test_equations_without_a_solution_report_the_time(monkeypatch):
     reason, = smooth(leg, config).reasons
     assert reason.code is Code.NOT_CONVERGED
     imu = make_problem(leg, config).imu
-    assert (f'do not determine the motion at t = {imu.t[imu.key[40]]:.1f} s. Likely cause: '
+    assert (f'do not determine the motion at t = {imu.t_keyframes[40]:.1f} s. Likely cause: '
             in reason.text)
 
 

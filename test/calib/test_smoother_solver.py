@@ -95,7 +95,7 @@ def test_bound_is_the_inverse_of_all_stacked_rows(correlation_time):
             power = correlation_time / 2 * np.array([levels['slow']] * 2 + [levels['slow_up']])
             add(np.concatenate([-decay * single[SLOW], single[SLOW]], axis=1),
                 (block(k), block(k + 1)), np.diag(1 / np.sqrt(power * (1 - decay**2))))
-    first = np.concatenate([*(np.broadcast_to(sigma, 3) for _, sigma in START_SIGMAS.values()),
+    first = np.concatenate([*(np.broadcast_to(sigma, 3) for _, sigma in START_SIGMAS),
                             problem.priors.gyro_bias_sigma, problem.priors.accel_bias_sigma])
     add(single[:15], (block(0),), np.diag(1 / first))
     if n == SIZE_WITH_SLOW:
@@ -163,7 +163,7 @@ def test_absent_constants_have_their_priors_in_the_marginal_information():
     H, g = _dense()
     solved = solve(_as_chain(H, g))
     normal, weights = _as_chain(H, g), np.array([4.0, 0.25])
-    normal.absent = weights
+    normal.unused_weights = weights
     some = solve(normal)
     whole, part = Normal(N, STATES, BORDER + 2), _as_chain(H, g)
     for to, of in zip((whole.diagonal, whole.upper, whole.g),
@@ -235,6 +235,6 @@ def test_turn_rates_in_a_file_are_read_in_chunks():
     assert w_b.nbytes > MAX_RESIDENT_BYTES
     release_mapped_memory()
     before = resident()
-    mean_rates_at(t, w_b, np.arange(1.0, rows * step - 1.0))
+    mean_rates_at(np.arange(1.0, rows * step - 1.0), t, w_b)
     # all times are read; the rates, if in memory as a whole, would add their own size
     assert resident(peak=True) - before - t.nbytes < w_b.nbytes / 2

@@ -21,7 +21,7 @@ from odocal_ros.library.calibrate_bag import calibrate_bag
 from odocal_ros.messages.decode import make_reader
 from odocal_ros.messages.message_fields import IMU
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.geodesy import FRAME_LONGITUDE, geodetic_of, LARGEST_FRAME
+from odocal_ros.nav.geodesy import FRAME_LONGITUDE, geodetic_from_local, LARGEST_FRAME
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code
 from odocal_ros.screening.fix_screen import covariances, has_position
@@ -147,7 +147,7 @@ def places(reach, n=200):
 @pytest.mark.parametrize('latitude_deg', [-85.0, -33.0, 0.0, 48.0, 85.0])
 def test_a_local_frame_is_a_tangent_plane_as_in_proj(latitude_deg):
     position = places(10_000.0)
-    lat, lon, height = geodetic_of(position, latitude_deg)
+    lat, lon, height = geodetic_from_local(position, latitude_deg)
     local = Transformer.from_pipeline(
         '+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 '
         f'+lat_0={latitude_deg} +lon_0={math.degrees(FRAME_LONGITUDE)} +h_0=0')
@@ -157,7 +157,7 @@ def test_a_local_frame_is_a_tangent_plane_as_in_proj(latitude_deg):
 
 def test_a_z_of_zero_is_not_a_height():
     """2D SLAM and AMCL do not measure it."""
-    _, _, height = geodetic_of(np.array([[3.0, 4.0, 0.0], [3.0, 4.0, 1e-3]]), math.nan)
+    _, _, height = geodetic_from_local(np.array([[3.0, 4.0, 0.0], [3.0, 4.0, 1e-3]]), math.nan)
     assert np.isnan(height[0])
     assert height[1] == pytest.approx(1e-3, abs=1e-5)    # 5 m from the origin: 2 um above it
 

@@ -14,7 +14,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData
 from odocal_ros.messages.decode import make_reader
 from odocal_ros.messages.transforms import add_static_readers
-from odocal_ros.nav.geodesy import geodetic_of
+from odocal_ros.nav.geodesy import geodetic_from_local
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
@@ -104,7 +104,7 @@ def test_a_chain_of_transforms_agrees_with_scipy():
     inside = T_MAP[1:]      # the first may be old
     assert t == pytest.approx(inside, abs=1e-9)
     # the positions of an arm of 0.37 m; the rotation between two transforms is 0.016 rad
-    off = np.abs(places - np.stack(geodetic_of(expected(inside), np.nan)))
+    off = np.abs(places - np.stack(geodetic_from_local(expected(inside), np.nan)))
     assert off[2].max() < 1e-7
     assert off[:2].max() < 1e-14
     assert (stamps[1] - stamps[0] == 10**6).all()       # the arrival of the correction

@@ -12,7 +12,7 @@ from odocal_ros.calib.drive import motion_reasons
 from odocal_ros.calib.gyro_axes import turn_ratio
 from odocal_ros.estimator.leg import drift_time, SmootherLeg
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
-from odocal_ros.nav.geodesy import GNSS_MOVES, LOCAL_MOVES, rate_without_north
+from odocal_ros.nav.geodesy import MIN_GNSS_MOTION, MIN_LOCAL_MOTION, rate_without_north
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
@@ -91,18 +91,18 @@ def room(rng):
 def test_rough_scale_in_a_room_is_that_of_its_straight_sections():
     t, fixes, route, _ = room(np.random.default_rng(1))
     travel = Travel(t, route / 1e-4, 1.0)
-    assert rough_scale(travel, t, fixes, 0.01, LOCAL_MOVES) == pytest.approx(1e-4, rel=0.05)
-    assert not motion_reasons(travel, t, fixes, 0.01, 200.0, LOCAL_MOVES)
-    assert motion_reasons(travel, t, fixes, 0.01, 200.0, GNSS_MOVES)
+    assert rough_scale(travel, t, fixes, 0.01, MIN_LOCAL_MOTION) == pytest.approx(1e-4, rel=0.05)
+    assert not motion_reasons(travel, t, fixes, 0.01, 200.0, MIN_LOCAL_MOTION)
+    assert motion_reasons(travel, t, fixes, 0.01, 200.0, MIN_GNSS_MOTION)
     # a reference that states a metre, and shows a centimetre
-    assert not motion_reasons(travel, t, fixes, 1.0, 200.0, LOCAL_MOVES)
+    assert not motion_reasons(travel, t, fixes, 1.0, 200.0, MIN_LOCAL_MOTION)
 
 
 def test_turns_on_the_spot_do_not_count_as_changes_of_course():
     t, fixes, _, faces = room(np.random.default_rng(2))
     rate = np.gradient(faces, t)
     for unit in (1.0, 57.3):
-        ratio = turn_ratio(t, unit * rate, t, fixes, 0.01, LOCAL_MOVES)
+        ratio = turn_ratio(t, unit * rate, t, fixes, 0.01, MIN_LOCAL_MOTION)
         assert ratio == pytest.approx(unit, rel=0.1)
 
 

@@ -25,19 +25,19 @@ WARM_TIME = 600.0    # s, physical: tyres warm within ten minutes of driving
 RATE_WINDOW = 0.1    # s about a keyframe, judgement: the mean of it contains little vibration
 
 
-def mean_rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
-    """Return turn rates at times ``at``, (N,), as means over RATE_WINDOW: (N, 3) rad/s."""
-    first = np.searchsorted(t, at - RATE_WINDOW / 2)
-    last = np.maximum(np.searchsorted(t, at + RATE_WINDOW / 2, side='right'), first + 1)
-    return np.stack([w_b[first[k]:last[k]].mean(axis=0)
-                     for k in iterate_releasing(range(len(at)))])
+def mean_rates_at(times: Floats, t: Floats, w_b: Floats) -> Floats:
+    """Return turn rates at N times, means of the samples within RATE_WINDOW: (N, 3) rad/s."""
+    first = np.searchsorted(t, times - RATE_WINDOW / 2)
+    end = np.maximum(np.searchsorted(t, times + RATE_WINDOW / 2, side='right'), first + 1)
+    return np.stack([w_b[first[k]:end[k]].mean(axis=0)
+                     for k in iterate_releasing(range(len(times)))])
 
 
 class Axle:
     """
     Motion of the origin of base_link, where the axle does not slip sideways, at a state.
 
-    v_n : (N, 3) m/s, its velocity at the keyframes.   wheel : (N,) m/s, forward speed at the
+    v_n : (N, 3) m/s, its velocity at the keyframes.   wheel_speed : (N,) m/s, forward, at the
     odometer.
     """
 
@@ -47,11 +47,11 @@ class Axle:
         rate = problem.rate_b - state.gyro_bias
         arm = state.constants[ODO_ARM] - leg.imu_arm
 
-        def at(arm_v: Floats) -> Floats:
+        def velocity_at(arm_v: Floats) -> Floats:
             return state.v_n + rotate(state.C_nb, np.cross(rate, state.C_bv @ arm_v))
 
-        self.v_n = at(arm)
-        self.wheel = self._forward_speed(at(arm + leg.odometer_arm))
+        self.v_n = velocity_at(arm)
+        self.wheel_speed = self._forward_speed(velocity_at(arm + leg.odometer_arm))
 
     def _forward_speed(self, v_n: Floats) -> Floats:
         speed: Floats = np.einsum('ki,ki->k', v_n, self.state.C_nb @ self.state.forward)
@@ -81,7 +81,7 @@ class Axle:
         bank: Floats = roll - share @ (roll - by_acceleration * acceleration)
         return bank
 
-    def accelerations(self, mean_rate: Floats) -> Floats:
+    def lean_accelerations(self, mean_rate: Floats) -> Floats:
         """
         Return the signals of BODY_LEAN in each interval: (K, 4).
 
@@ -99,7 +99,7 @@ class Axle:
         jerk = np.gradient(force, axis=0) / T[:, None] if len(T) > 1 else np.zeros_like(force)
         return np.concatenate([force, jerk], axis=1)
 
-    def acceleration(self) -> Floats:
+    def traction_acceleration(self) -> Floats:
         """Return the acceleration by traction (positive) and braking, (S11): (K,) m/s^2."""
         # by speeds: in a turn with sideslip the centripetal acceleration has a forward component
         speed = self._forward_speed(self.v_n)
@@ -112,7 +112,8 @@ class Axle:
         path = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
         share = path / max(path.sum(), 1e-9)
-        mean: Floats = share @ tyre_signals_at(path / sums.T, t - state.t[0], self.acceleration())
+        mean: Floats = share @ tyre_signals_at(path / sums.T, t - state.t[0],
+                                               self.traction_acceleration())
         return mean
 
 

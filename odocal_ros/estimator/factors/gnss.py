@@ -19,11 +19,11 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import ExternalRows, PointRows, Rows
-from odocal_ros.estimator.leg import enu_to_n, ExternalSamples, thinned
+from odocal_ros.estimator.leg import enu_to_n, ExternalSamples, thinning
 from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
-from odocal_ros.nav.receiver_filter import own_odometer_error, smoothing_error
+from odocal_ros.nav.receiver_filter import filter_error, odometer_error
 from odocal_ros.nav.rotations import rotate, skew, transpose
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
@@ -72,10 +72,10 @@ class Fixes(PointRows):
         measured = point.intervals.dv[k] / T[:, None]
         self.signal_noise = force_signals(fitted - measured) * point.fitted
         # effects of a filter and of an odometer in the receiver, and their derivatives
-        track = (state.t, *antenna(state, point.intervals.mean_rate, arm_b),
+        track = (state.t, *antenna_motion(state, point.intervals.mean_rate, arm_b),
                  state.t[k] + points.tau)
-        smoothed, self.by_lag = smoothing_error(*track, state.constants[layout.FIX_LAG2])
-        added, self.by_motion, self.by_time = own_odometer_error(
+        smoothed, self.by_lag = filter_error(*track, state.constants[layout.FIX_LAG2])
+        added, self.by_motion, self.by_time = odometer_error(
             *track, state.constants[layout.FIX_BY_MOTION], state.constants[layout.FIX_MOTION_TIME])
         stated = leg.stated_sigma[problem.used_fixes]
         # minus the median, as a constant error does not affect the results
@@ -133,7 +133,7 @@ class Fixes(PointRows):
 
     def existing_components(self) -> Bools:
         exists = np.ones((len(self.k), 3), bool)
-        exists[:, 2] = self.whitening[:, 2, 2] > 1e-5       # see ``whitener``
+        exists[:, 2] = self.whitening[:, 2, 2] > 1e-5       # see ``inverse_cholesky``
         return exists
 
 
@@ -144,14 +144,14 @@ def force_signals(force: Floats) -> Floats:
     return out
 
 
-def antenna(state: layout.State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
+def antenna_motion(state: layout.State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
     """Return position and velocity of the antenna at the keyframes: (N, 3) m, (N, 3) m/s."""
     rate = np.concatenate([mean_rate[:1], (mean_rate[:-1] + mean_rate[1:]) / 2, mean_rate[-1:]])
     return (state.p_n + state.C_nb @ arm_b,
             state.v_n + rotate(state.C_nb, np.cross(rate, arm_b)))
 
 
-def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
+def inverse_cholesky(covariance_n: Floats, no_height: Bools) -> Floats:
     """Return the inverse Cholesky factors of covariances; a missing height has no weight."""
     C = covariance_n.copy()
     C[no_height, 2, :] = C[no_height, :, 2] = 0.0
@@ -180,7 +180,7 @@ class VelocityRows(ExternalRows):
         # without an accelerometer the change of velocity between keyframes is unknown
         if not (config.gnss.use_velocity and len(t) and inputs.has_accelerometer):
             return None
-        some = thinned(t)
+        some = thinning(t)
         t, variance = t[some], samples.variance_n[some, :2]
         known = np.isfinite(variance) & (variance > 0)
         sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
@@ -203,9 +203,9 @@ class VelocityRows(ExternalRows):
         arm_b = state.C_bv @ arm_v
         dv, g = rotate(C, points.dv), gravity_n(state.p_n[k], leg.origin)
         swing = rotate(C_nb, np.cross(points.rate, arm_b))
-        _, v_keys = antenna(state, point.intervals.mean_rate, arm_b)
+        _, v_keys = antenna_motion(state, point.intervals.mean_rate, arm_b)
         acceleration = (np.diff(v_keys, axis=0) / point.intervals.T[:, None])[k]
-        smoothed, by_lag = smoothing_error(state.t, v_keys, np.gradient(v_keys, state.t, axis=0),
+        smoothed, by_lag = filter_error(state.t, v_keys, np.gradient(v_keys, state.t, axis=0),
                                            state.t[k] + points.tau,
                                            state.constants[layout.VELOCITY_LAG2])
         v = state.v_n[k] + dv + g * tau + swing + smoothed

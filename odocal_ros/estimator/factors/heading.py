@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
-from odocal_ros.estimator.leg import convergence, ExternalSamples, thinned
+from odocal_ros.estimator.leg import ExternalSamples, meridian_convergence, thinning
 from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BG, GYRO, HEADING, M, PHI, SIZE_WITHOUT_SLOW
@@ -51,8 +51,9 @@ class HeadingRows(ExternalRows):
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Heading | None:
         source, alignment = config.alignment.heading_source, config.alignment
         if not np.isnan(alignment.heading) and source in ('auto', 'fixed'):
-            yaw = yaw_from_heading(alignment.heading) + convergence(inputs, np.zeros(1), origin)
-            return Heading(np.zeros(1), wrap(yaw), np.full(1, CONFIGURED_NOISE),
+            t = np.zeros(1)
+            yaw = yaw_from_heading(alignment.heading) + meridian_convergence(inputs, t, origin)
+            return Heading(t, wrap(yaw), np.full(1, CONFIGURED_NOISE),
                            alignment.heading_sigma, 'fixed')
         if source in ('auto', 'heading_topic'):
             samples, t = inputs.external['heading']
@@ -111,12 +112,12 @@ def _from_orientations(inputs: Inputs, t: Floats, q: Floats, variance: Floats, o
     t, q, variance = t[good], q[good], variance[good]
     if len(t) < 2 or not len(inputs.t_fix):
         return None
-    kept = thinned(t)
+    kept = thinning(t)
     t, q, variance = t[kept], q[kept], variance[kept]
     stated = float(np.median(variance))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
         return None
     C = matrix_from_quat(q) @ C_ib
-    yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + convergence(inputs, t, origin)
+    yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + meridian_convergence(inputs, t, origin)
     return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), source_name)

@@ -41,13 +41,13 @@ from odocal_ros.settings.levels import SWAY
 
 # m/sqrt(s), lower limit of sideslip noise if turns determine it. Tuned: the yaw sigma of simulated
 # vehicles, which do not slide, then matches their errors (docs/decisions/0005)
-TURN_SLIDE = 2e-4
+MIN_TURN_SIDESLIP = 2e-4
 # m/sqrt(s), lower limit of vertical motion that the unknowns do not describe: springs, tyres,
 # road. Tuned: with a tenth of it, pitch was 3 sigmas off on drives in yards (docs/decisions/0005)
-HEAVE = 2e-3
+MIN_VERTICAL_NOISE = 2e-3
 # m/rad, unmodelled lift of the axle per pitch of the body within an interval, as by kerbs shorter
 # than a wheelbase: initial value and lower limit, judgement; the value is estimated for each drive
-PITCHING, PITCHING_LEAST = 0.03, 1e-4
+PITCHING, MIN_PITCHING = 0.03, 1e-4
 # m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
 # rad, total turn angle: one corner does not determine sideslip, two do. Judgement
@@ -65,15 +65,15 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(2)[0] + 1) / 2, \
 # rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s
 TURNING_RATE = 0.05
 # m, minimum error of the travel of an interval at rest: physical, play of a drive train
-REST_NOISE = 5e-4
+MIN_REST_NOISE = 5e-4
 # rad/s, m/s^2, 1 sigma of the unknown motion within a gap: judgement, of a car in town
-HIDDEN_RATE, HIDDEN_FORCE = 0.1, 1.5
+GAP_RATE, GAP_FORCE = 0.1, 1.5
 ABSENT_VARIANCE = 1e4   # m^2, of travel that is not observed
 
 
 def total_turn(leg: SmootherLeg, imu: ImuSteps) -> float:
     """Return the sum of the absolute angles of turns faster than TURNING_RATE, rad."""
-    t = imu.t[imu.key]
+    t = imu.t_keyframes
     T = np.diff(t)
     bias = gyro_bias_at_rest(leg, imu)
     turn = imu.over_intervals(imu.turn) - (0.0 if bias is None else bias) * T[:, None]
@@ -87,7 +87,7 @@ def total_turn(leg: SmootherLeg, imu: ImuSteps) -> float:
 def min_sideslip(angle: float) -> float:
     """Return the lower limit of sideslip noise, m/sqrt(s); angle : rad, of all turns of a leg."""
     corners = np.clip((angle - CORNER_ANGLE) / CORNER_ANGLE, 0.0, 1.0)
-    return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**corners)
+    return float(ORDINARY_ROAD * (MIN_TURN_SIDESLIP / ORDINARY_ROAD)**corners)
 
 
 def road_levels(total_turn: float) -> tuple[dict[str, float], dict[str, float]]:
@@ -96,7 +96,7 @@ def road_levels(total_turn: float) -> tuple[dict[str, float], dict[str, float]]:
     return (dict.fromkeys(ALONG, road) | dict.fromkeys(SIDEWAYS, max(road, sideslip))
             | {'pitching': PITCHING**2},
             dict.fromkeys(ALONG, MIN_NOISE.road**2) | dict.fromkeys(SIDEWAYS, sideslip)
-            | {'up': max(sideslip, HEAVE**2), 'pitching': PITCHING_LEAST**2})
+            | {'up': max(sideslip, MIN_VERTICAL_NOISE**2), 'pitching': MIN_PITCHING**2})
 
 
 def assumed_noise_reasons(problem: Problem, levels: Levels) -> list[Reason]:
@@ -245,7 +245,7 @@ def _known_columns(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) 
 def rest_noise(speed: Floats, rest: Bools) -> float:
     """Return the variance of the travel of an interval at rest, m^2; speed : (K,) m/s."""
     measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s: judgement
-    return max(measured, REST_NOISE**2)
+    return max(measured, MIN_REST_NOISE**2)
 
 
 def accelerating_and_turning(motion: Motion) -> tuple[Bools, Bools]:
@@ -266,9 +266,9 @@ def _known_variances(motion: Motion, leg: SmootherLeg) -> Floats:
     # s: motion within a longer step between IMU samples is unknown
     gap = np.where(sums.longest_step > max(0.06, 3 * np.median(sums.longest_step)),
                    sums.longest_step, 0.0)
-    variances[:, PHI] = (HIDDEN_RATE * gap[:, None])**2
-    variances[:, V] = (HIDDEN_FORCE * gap[:, None])**2
-    variances[:, P] = (HIDDEN_FORCE * gap * T)[:, None]**2
+    variances[:, PHI] = (GAP_RATE * gap[:, None])**2
+    variances[:, V] = (GAP_FORCE * gap[:, None])**2
+    variances[:, P] = (GAP_FORCE * gap * T)[:, None]**2
     t, travel = motion.state.t, leg.travel
     stamp = stamp_of(t, motion.state.constants)
     outside = (stamp[:-1] < travel.t[0]) | (stamp[1:] > travel.t[-1])
@@ -291,5 +291,5 @@ def _gap_variances(stamp: Floats, travel: Travel, scale: float) -> Floats:
         inside = (stamp[1:] > begin) & (stamp[:-1] < end)
         T = np.minimum(np.diff(stamp)[inside], (end - begin) / 4)
         path = scale * abs(float(np.diff(travel.at(np.array([begin, end])))[0]))
-        variance[inside] += np.minimum(HIDDEN_FORCE * (end - begin) * T / 2, path)**2
+        variance[inside] += np.minimum(GAP_FORCE * (end - begin) * T / 2, path)**2
     return variance

@@ -145,12 +145,12 @@ class Motion:
     def _vary_axis(self) -> Floats:
         """Return K delta d of (S12), (K, 3), and set the signals of (S11) and (S12)."""
         state, T, c = self.state, self.T, self.state.constants
-        self.lean_accelerations = self.axle.accelerations(self.sums.mean_rate)
+        self.lean_accelerations = self.axle.lean_accelerations(self.sums.mean_rate)
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         self.t_middle = (state.t[1:] + state.t[:-1]) / 2
         self.tyre_signals = tyre_signals_at(
             speed, self.t_middle - state.t[0],
-            self.axle.acceleration()) - self.axle.means_by_path(self.sums)
+            self.axle.traction_acceleration()) - self.axle.means_by_path(self.sums)
         self.half_pitch_variance = np.maximum(
             self.left @ self.angle_covariances @ self.left, 0.0) / 2
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES, None] \
@@ -191,9 +191,9 @@ class Motion:
     def _derivative_by_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
         # by the estimated speed, whose changes the accelerometer measures better than the odometer
-        wheel = self.axle.wheel / self.state.scale
-        acceleration = np.gradient(wheel, self.state.t)
-        return np.stack([np.diff(wheel), -np.diff(acceleration) / 2], -1)
+        speed = self.axle.wheel_speed / self.state.scale
+        acceleration = np.gradient(speed, self.state.t)
+        return np.stack([np.diff(speed), -np.diff(acceleration) / 2], -1)
 
     def jacobians(self, n: int) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by start, end and constants: (K, 18, n), (K, 18, n), (K, 18, M)."""

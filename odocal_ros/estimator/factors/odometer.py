@@ -169,8 +169,8 @@ class SpeedSteps(PointRows):
         c = state.constants
         axle = Axle(problem, state)
         self.tyre_signals = tyre_signals_at(
-            self.speed, state.t[self.k] - state.t[0] + points.tau, axle.acceleration()[self.k]
-        ) - axle.means_by_path(point.intervals)
+            self.speed, state.t[self.k] - state.t[0] + points.tau,
+            axle.traction_acceleration()[self.k]) - axle.means_by_path(point.intervals)
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES]
         speed_by_wheel = self.instants.value + self.instants.sign * c[layout.SPEED_OFFSET]
         speed_by_wheel *= state.scale * self.scale_ratio
@@ -186,7 +186,7 @@ class SpeedSteps(PointRows):
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
         """Return the times of the steps, s, then the times at which the filter needs a speed."""
-        stamp, keyframes = _within(problem).t, problem.imu.t[problem.imu.key]
+        stamp, keyframes = _within(problem).t, problem.imu.t_keyframes
         t = stamp - constants[layout.ODO_DELAY] - constants[layout.ODO_CLOCK] * stamp
         delays = filter_time(constants) * FILTER_AGES
         return np.concatenate([t, np.clip(
@@ -231,7 +231,7 @@ class SpeedSteps(PointRows):
 
 def _within(problem: Problem) -> SpeedInstants:
     """Return the steps of the speed between the first and the last keyframe."""
-    t, coarse = problem.imu.t[problem.imu.key], problem.leg.travel.coarse
+    t, coarse = problem.imu.t_keyframes, problem.leg.travel.coarse
     assert coarse is not None, 'uses_speed_steps'
     return coarse.instants.between(t[0], t[-1])
 

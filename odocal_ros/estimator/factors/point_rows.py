@@ -13,7 +13,7 @@ new sensor is one subclass of it, listed in ``equations.FACTORS``.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -156,19 +156,11 @@ class PointRows(Factor):
         """Yield intervals with rows, some at a time, and the function that groups their rows."""
         present, first, count = np.unique(self.k, return_index=True, return_counts=True)
         for some in blocks(len(present)):
-            counts, largest = count[some], count.max()
+            counts, largest = count[some], int(count.max())
             rows = slice(first[some.start], first[some.start] + counts.sum())
             interval = np.repeat(np.arange(len(counts)), counts)
             place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-
-            def gather(x: Floats, rows: slice = rows, interval: Ints = interval,
-                       place: Ints = place, counts: Ints = counts,
-                       largest: int = largest) -> Floats:
-                out = np.zeros((len(counts), largest, *x.shape[1:]))
-                out[interval, place] = x[rows]
-                return out.reshape(len(counts), -1, x.shape[2])
-
-            yield present[some], gather
+            yield present[some], partial(_gather, rows, interval, place, (len(counts), largest))
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         if len(self.k) < MIN_ROWS:
@@ -217,6 +209,13 @@ class PointRows(Factor):
                 X = X + cross[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)
             effects.append(X)
         yield self.source, np.concatenate(effects)
+
+
+def _gather(rows: slice, interval: Ints, place: Ints, shape: tuple[int, int], x: Floats) -> Floats:
+    """Return rows of x, (m, d, c), by interval and place in it; zeros where there is no row."""
+    out = np.zeros((*shape, *x.shape[1:]))
+    out[interval, place] = x[rows]
+    return out.reshape(shape[0], -1, x.shape[2])
 
 
 def rows_per_independent(rows: PointRows) -> float:

@@ -36,12 +36,10 @@ SIZE_SPREADS = dict.fromkeys(SIZES, 1.0) | {'size_fix_error_by_motion': 3.0}
 LOG_SIZES = np.arange(np.log(1e-6), np.log(1e6), 0.05)
 # priors of the first keyframe: m, m/s, rad about east, north, up. Judgement: far wider than any
 # data
-START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
-    'position': (layout.P, 1e4), 'velocity': (layout.V, 100.0),
-    'attitude': (layout.PHI, np.array([1.0, 1.0, 10.0]))}
+START_SIGMAS = ((layout.P, 1e4), (layout.V, 100.0), (layout.PHI, np.array([1.0, 1.0, 10.0])))
 # definition: column of the height, and its prior, m, if no fix has a height; with 1e4 m the
 # rounding error is too large
-UP, LEVEL_START = slice(layout.P.stop - 1, layout.P.stop), 1.0
+HEIGHT, HEIGHT_START_SIGMA = slice(layout.P.stop - 1, layout.P.stop), 1.0
 # constants that all legs of a vehicle share, by source in the budget
 SHARED: dict[str, slice | Ints] = {
     'odometer_lever_arm': layout.ODO_ARM, 'antenna_lever_arm': layout.GNSS_ARM,
@@ -135,16 +133,16 @@ class PriorRows(factor.Factor):
 
     def add(self, out: Normal) -> None:
         # the first keyframe has a wide prior, with its value as mean
-        for columns, sigma in START_SIGMAS.values():
+        for columns, sigma in START_SIGMAS:
             factor.add_prior(out, 0, columns, sigma**2, 0.0)
         if self.no_heights:
-            factor.add_prior(out, 0, UP, LEVEL_START**2, 0.0)
+            factor.add_prior(out, 0, HEIGHT, HEIGHT_START_SIGMA**2, 0.0)
         for columns, value, sigma in self._biases():
             factor.add_prior(out, 0, columns, sigma**2, value)
         w, m = 1 / self.priors.sigma**2, self.m
         out.corner[range(m), range(m)] += w[:m]
         out.g_constants -= (w * self._deviations())[:m]
-        out.absent = w[m:]
+        out.unused_weights = w[m:]
 
     def cost(self) -> float:
         total = sum((value**2 / sigma**2).sum() for _, value, sigma in self._biases())

@@ -27,12 +27,14 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE, SCALE_LIMIT
 from odocal_ros.settings.nominal import nominal_yaw
 
-AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
-# rad from nominal, judgement: no IMU is mounted so
+AXIS_NAMES = {'x': 'forward', 'y': 'left', 'z': 'up'}
+# rad, judgement: yaw mounting minus its nominal value above which the counts are reversed
 REVERSED_YAW = np.deg2rad(135.0)
 UNITS = dict.fromkeys(layout.CONSTANTS, 'm') | {
     'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
     'gnss_delay': 's'}
+# remedy if an angle would be determined without the factor for model errors
+OTHER_WARNINGS = 'Follow the actions of the other warnings first.'
 # constants that are stated if the drive determines them: lever arms and delays
 OPTIONAL = range(layout.ODO_ARM.start, layout.HEADING)
 
@@ -56,10 +58,6 @@ def implausible_imu_reasons(fit: Fit) -> list[Reason]:
                    f'{layout.CONSTANTS[worst].replace("_", " ")} of {100 * c[worst]:+z.0f} %, '
                    f'impossible for an IMU (limit {100 * limit:.0f} %). Likely cause: wrong '
                    'units, axes or time offsets, or a local minimum')]
-
-
-# the angle would be determined without the factor for model errors
-OTHER_WARNINGS = 'Follow the actions of the other warnings first.'
 
 
 def unknown_estimates(scale_unit: str) -> dict[str, Estimate]:
@@ -162,10 +160,10 @@ def join_names(names: Iterable[str]) -> str:
     words: dict[str, list[str]] = {}
     for name in names:
         stem, _, axis = name.rpartition('_')
-        if axis not in AXES:
+        if axis not in AXIS_NAMES:
             stem, axis = name, ''
         words.setdefault(stem.replace('gnss', 'fix').replace('_', ' '), []).append(
-            AXES.get(axis, ''))
+            AXIS_NAMES.get(axis, ''))
     texts = [f'the {word}' + (f' ({", ".join(axes)})' if 0 < len(axes) < 3 and axes[0] else '')
              for word, axes in words.items()]
     return texts[0] if len(texts) == 1 else f'{", ".join(texts[:-1])} and {texts[-1]}'

@@ -30,18 +30,18 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import REMARK_SIGMAS
 from odocal_ros.settings.nominal import grade_of, turn_on_bias
 
-WORSE_THAN_GRADE = 3.0      # judgement: limit of noise or bias over that of its grade
+MAX_RATIO_TO_GRADE = 3.0      # judgement: limit of noise or bias over that of its grade
 # limits of accelerometer outliers: size, m/s per second, share and number of seconds. Judgement:
 # aliased vibration makes 0.05 to 0.13 in 1.3 % or more, kerbs under a robot at most 0.01, ordinary
 # drives have outliers in 0.5 %; one or two shocks of a short drive are no vibration
-OUTLIER_SIZE, OUTLIER_TIME, MIN_ACCEL_OUTLIERS = 0.01, 0.01, 3
-FINEST = 1e-5           # rad/s and m/s^2, physical: finer steps have no effect
-SAMPLES = 20_000        # judgement: number of samples in which a quantisation step is sought
+MIN_ACCEL_OUTLIER, ACCEL_OUTLIER_SHARE, MIN_ACCEL_OUTLIERS = 0.01, 0.01, 3
+MIN_QUANTISATION = 1e-5    # rad/s and m/s^2, physical: finer steps have no effect
+QUANTISATION_SAMPLES = 20_000    # judgement: samples in which a quantisation step is sought
 SAMPLES_PER_VALUE = 20  # judgement: a signal with more samples for each value is quantised
-EXPLAINED = 0.4         # judgement: share of the noise variance that quantisation must explain
+MIN_EXPLAINED_SHARE = 0.4  # judgement: of the noise variance, if quantisation is its cause
 # judgement: limit of the noise of single samples in motion over that at rest. Real drives:
 # vibrating accelerometers 26 and 3.6, gyros 1.3 and 2.0
-VIBRATION = 3.0
+MAX_MOTION_RATIO = 3.0
 MAX_NOISE_SAMPLES = 2**18    # judgement: their median has a sigma of 0.2 %; more only take memory
 MIN_NOISE_SAMPLES = 100    # judgement: their median has a sigma of 15 %
 # judgement: share of outliers among the fixes, and of intervals with slip
@@ -67,18 +67,18 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
     level = fit.levels.sigmas()
     excess, noise_texts, remedy = _noise_over_grade(problem, level, config)
     # vibration is not white, and its spectrum is unknown
-    noisy = excess > WORSE_THAN_GRADE
-    worse = noise_texts + _biases_over_grade(problem, fit, config)
+    is_noisy = excess > MAX_RATIO_TO_GRADE
+    texts = noise_texts + _biases_over_grade(problem, fit, config)
     reasons = [Reason(
-        Code.IMU_WORSE_THAN_GRADE, f'{" and ".join(worse)} times that of the {config.imu.grade} '
-        f'grade (limit {WORSE_THAN_GRADE:g}); the size estimated on this drive is used'
-        + '. The noise may not be white; uncertainties were increased' * noisy,
-        remedy)] if worse else []
+        Code.IMU_WORSE_THAN_GRADE, f'{" and ".join(texts)} times that of the {config.imu.grade} '
+        f'grade (limit {MAX_RATIO_TO_GRADE:g}); the size estimated on this drive is used'
+        + '. The noise may not be white; uncertainties were increased' * is_noisy,
+        remedy)] if texts else []
     reasons += _accelerometer_outlier_reasons(fit)
     contradictions, step = _convergence_texts(fit)
-    if noisy and not worse:
-        contradictions[f'IMU noise is {differing(excess, WORSE_THAN_GRADE)} times that of its '
-                       f'grade (limit {WORSE_THAN_GRADE:g}) and may not be white'] = remedy
+    if is_noisy and not texts:
+        contradictions[f'IMU noise is {differing(excess, MAX_RATIO_TO_GRADE)} times that of its '
+                       f'grade (limit {MAX_RATIO_TO_GRADE:g}) and may not be white'] = remedy
     contradictions |= _level_texts(problem, fit, level)
     reasons += _heading_reasons(problem.external.get('heading'),
                                 float(fit.state.constants[HEADING]))
@@ -87,7 +87,7 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
                               ' '.join(contradictions.values())))
     # judgement: the size of a model error is unknown; a fit that has not converged may be off by
     # several times its last step
-    return max(1.0, 2.0 * bool(contradictions or noisy), 4.0 * step), reasons
+    return max(1.0, 2.0 * bool(contradictions or is_noisy), 4.0 * step), reasons
 
 
 def _noise_over_grade(problem: Problem, level: dict[str, float],
@@ -101,11 +101,11 @@ def _noise_over_grade(problem: Problem, level: dict[str, float],
     # no reasons about an accelerometer that does not exist
     sensors = _sensors(problem)
     texts = [f'{NAMES[name]} noise is '
-             f'{differing(level[name] / configured[name], WORSE_THAN_GRADE)}'
-             for name in sensors if level[name] > WORSE_THAN_GRADE * configured[name]]
+             f'{differing(level[name] / configured[name], MAX_RATIO_TO_GRADE)}'
+             for name in sensors if level[name] > MAX_RATIO_TO_GRADE * configured[name]]
     remedy = find_noise_cause(problem, level, [
         name for name in sensors
-        if level[name] > WORSE_THAN_GRADE * min(used[name], configured[name])])
+        if level[name] > MAX_RATIO_TO_GRADE * min(used[name], configured[name])])
     return max(level[name] / used[name] for name in sensors), texts, remedy
 
 
@@ -116,15 +116,15 @@ def _sensors(problem: Problem) -> list[str]:
 
 def _biases_over_grade(problem: Problem, fit: Fit, config: Config) -> list[str]:
     """Return texts of the biases that exceed the grade."""
-    gyro_sold, accel_sold = turn_on_bias(config.imu)
-    biases = {'gyro': (fit.state.gyro_bias[0], problem.priors.gyro_bias_sigma, gyro_sold),
-              'accel': (fit.state.accel_bias[0], problem.priors.accel_bias_sigma, accel_sold)}
+    gyro_stated, accel_stated = turn_on_bias(config.imu)
+    biases = {'gyro': (fit.state.gyro_bias[0], problem.priors.gyro_bias_sigma, gyro_stated),
+              'accel': (fit.state.accel_bias[0], problem.priors.accel_bias_sigma, accel_stated)}
     texts = []
     for name in _sensors(problem):
-        bias, sigma, sold = biases[name]
-        if np.max(np.abs(bias) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE:
+        bias, sigma, stated = biases[name]
+        if np.max(np.abs(bias) / np.maximum(2 * sigma, stated)) > MAX_RATIO_TO_GRADE:
             texts.append(f'{NAMES[name]} bias is '
-                         f'{differing(np.max(np.abs(bias) / sigma), WORSE_THAN_GRADE)}')
+                         f'{differing(np.max(np.abs(bias) / sigma), MAX_RATIO_TO_GRADE)}')
     return texts
 
 
@@ -167,9 +167,9 @@ def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
     """Return the reason for an accelerometer with many outliers."""
     factor = fit.variance_factors[:, ACCEL_NOISE]
     size = np.sqrt(factor * fit.levels['accel'])
-    outlier = (factor > SLIP_VARIANCE) & (size > OUTLIER_SIZE)
+    outlier = (factor > SLIP_VARIANCE) & (size > MIN_ACCEL_OUTLIER)
     share = float(outlier.mean())
-    if share < OUTLIER_TIME or outlier.sum() < MIN_ACCEL_OUTLIERS:
+    if share < ACCEL_OUTLIER_SHARE or outlier.sum() < MIN_ACCEL_OUTLIERS:
         return []
     return [Reason(
         Code.IMU_WORSE_THAN_GRADE, f'the accelerometer has outliers in {100 * share:.0f} % of the '
@@ -205,27 +205,27 @@ def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]
     """
     if not worse:
         return ''
-    coarse = {name: step for name, step in find_quantised(problem.leg, level).items()
+    quantised = {name: step for name, step in find_quantisation_steps(problem.leg, level).items()
               if name in worse}
     vibrating: dict[str, str] = {}
     sensor_noise_names: list[str] = []
     unknown: list[str] = []
     in_motion, at_rest = sample_noise_by_motion(problem)
-    for name in (name for name in worse if name not in coarse):
+    for name in (name for name in worse if name not in quantised):
         rest, motion = at_rest.get(name, 0.0), in_motion.get(name, 0.0)
-        if rest and motion > VIBRATION * rest:
+        if rest and motion > MAX_MOTION_RATIO * rest:
             vibrating[name] = (f'{NAMES[name]} samples vary {motion / rest:.0f} times as much '
                                'in motion as at rest')
-        elif not rest and motion > VIBRATION * level[name]:
+        elif not rest and motion > MAX_MOTION_RATIO * level[name]:
             vibrating[name] = (f'{NAMES[name]} samples vary {motion / level[name]:.0f} times as '
                                'much as their means over seconds')
         else:
-            (sensor_noise_names if VIBRATION * rest > level[name] else unknown).append(name)
+            (sensor_noise_names if MAX_MOTION_RATIO * rest > level[name] else unknown).append(name)
     texts = []
-    if coarse:
-        texts.append(f'{_cause_of(coarse, worse)} is quantisation: {_steps_in_words(coarse)}. Set '
-                     'a finer resolution or a smaller range in the IMU or its driver, if there is '
-                     'one.')
+    if quantised:
+        texts.append(f'{_cause_of(quantised, worse)} is quantisation: '
+                     f'{_steps_in_words(quantised)}. Set a finer resolution or a smaller range in '
+                     'the IMU or its driver, if there is one.')
     if vibrating:
         texts.append(f'{_cause_of(vibrating, worse)} is vibration: '
                      f'{", ".join(vibrating.values())}. Mount the IMU firmly and away from '
@@ -250,17 +250,18 @@ def _cause_of(names: Collection[str], worse: Collection[str]) -> str:
 
 def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     """Return the white noise of samples in motion and at rest, by sensor; {}: too few samples."""
-    leg, keys = problem.leg, problem.imu.t[problem.imu.key]
-    rest = problem.at_rest[:-1] & problem.at_rest[1:]
+    leg, t_keyframes = problem.leg, problem.imu.t_keyframes
+    intervals_at_rest = problem.at_rest[:-1] & problem.at_rest[1:]
 
-    def part(t: Floats) -> Array:
+    def kind_of_motion(t: Floats) -> Array:
         """Return 0 in motion, 1 at rest, 2 outside the keyframes."""
-        at = np.searchsorted(keys, t, side='right') - 1
-        inside = (t >= keys[0]) & (t < keys[-1])
-        return np.where(inside, rest[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
+        interval = np.searchsorted(t_keyframes, t, side='right') - 1
+        inside = (t >= t_keyframes[0]) & (t < t_keyframes[-1])
+        interval = np.clip(interval, 0, len(intervals_at_rest) - 1)
+        return np.where(inside, intervals_at_rest[interval], 2).astype(np.uint8)
 
-    parts = map_rows(part, leg.t_imu)
-    in_motion, at_rest = (np.flatnonzero(parts == kind)[:MAX_NOISE_SAMPLES] for kind in (0, 1))
+    kinds = map_rows(kind_of_motion, leg.t_imu)
+    in_motion, at_rest = (np.flatnonzero(kinds == kind)[:MAX_NOISE_SAMPLES] for kind in (0, 1))
     return (sample_noise(leg, in_motion) if len(in_motion) >= MIN_NOISE_SAMPLES else {},
             sample_noise(leg, at_rest) if len(at_rest) >= MIN_NOISE_SAMPLES else {})
 
@@ -276,20 +277,20 @@ def _steps_in_words(steps: dict[str, float]) -> str:
         for name, step in steps.items())
 
 
-def find_quantised(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:
+def find_quantisation_steps(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:
     """Return quantisation steps, rad/s, m/s^2, that explain white noise, SI per sqrt(Hz)."""
-    T = float(np.median(np.diff(leg.t_imu[:SAMPLES])))
+    T = float(np.median(np.diff(leg.t_imu[:QUANTISATION_SAMPLES])))
     steps = {'gyro': _step(leg.w_b), 'accel': _step(leg.f_b)}
     return {name: step for name, step in steps.items()
-            if step**2 / 12 * T > EXPLAINED * level[name]**2}
+            if step**2 / 12 * T > MIN_EXPLAINED_SHARE * level[name]**2}
 
 
 def _step(x: Floats) -> float:
     """Return the largest quantisation step of the columns of a signal, 0 if there is none."""
-    rows = thinned(x, SAMPLES)
+    rows = thinned(x, QUANTISATION_SAMPLES)
     largest = 0.0
     for column in rows.T:
-        values = np.unique(np.round(column / FINEST))
+        values = np.unique(np.round(column / MIN_QUANTISATION))
         if 2 < len(values) < len(rows) / SAMPLES_PER_VALUE:
-            largest = max(largest, float(np.median(np.diff(values))) * FINEST)
+            largest = max(largest, float(np.median(np.diff(values))) * MIN_QUANTISATION)
     return largest

@@ -32,7 +32,7 @@ from odocal_ros.settings.nominal import grade_of
 CLOCKS = {'fix': layout.GNSS_CLOCK, 'odometer': layout.ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswith(
     ('gyro_scale', 'accelerometer_scale')))
-AXES = layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz')
+ACCEL_AXES = layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz')
 IMU_ERROR_LIMIT = 4.0       # statistical: sigmas of the grade, for scales and axes
 # F of (S31), relative, rad, rad: physical, a body on springs in a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
@@ -120,9 +120,9 @@ def _imu_reasons(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
     error = np.zeros(len(c))        # in sigmas of the grade
     error[layout.IMPERFECTIONS] = np.abs(c[layout.IMPERFECTIONS]) / np.maximum(usual, 1e-300)
     error *= np.abs(c) > REMARK_SIGMAS * sigma
-    skew = float(np.linalg.norm(error[AXES]))
+    skew = float(np.linalg.norm(error[ACCEL_AXES]))
     if skew > IMU_ERROR_LIMIT:
-        angle = np.rad2deg(np.linalg.norm(c[AXES][error[AXES] > 0]))
+        angle = np.rad2deg(np.linalg.norm(c[ACCEL_AXES][error[ACCEL_AXES] > 0]))
         reasons.append(Reason(
             Code.IMU_AXES_SKEW, f'accelerometer axes are {angle:.2f} deg off perpendicular, '
             f'{skew:.0f} times the sigma of the {config.imu.grade} grade '

@@ -28,7 +28,7 @@ from odocal_ros.nav.rotations import transpose
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-OF_INTERVALS = ('odometer', 'gyro', 'accelerometer')
+INTERVAL_SENSORS = ('odometer', 'gyro', 'accelerometer')
 # variance factor of an interval above which it is a slip. Statistical: 3.7 sigmas, by chance once
 # in 4200
 SLIP_VARIANCE = 1.5
@@ -85,7 +85,7 @@ def normalised_residuals(weighted: Weighted) -> dict[str, dict[str, float]]:
 def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
     """Return residuals and sigmas of odometer, gyro and accelerometer: (K, 3) each."""
     motion = fit.weighted[MotionRows]
-    parts_by_kind: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in OF_INTERVALS}
+    parts_by_kind: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in INTERVAL_SENSORS}
     T, C, C_end = (getattr(motion.motion, name) for name in ('T', 'C', 'C_end'))
     for some in blocks(len(motion.r)):
         root = np.linalg.inv(motion.whiten[some])

@@ -16,10 +16,9 @@ from odocal_ros.settings import levels
 from odocal_ros.settings.config import Config, SIDES
 from odocal_ros.settings.levels import TRACK_WIDTH
 
-Found = tuple[dict[str, Estimate], list[Reason]]
 MIN_COMPARED_WHEELS = 3     # wheels, definition: with fewer, it is unknown which one differs
 # relative, judgement: difference of new tyres of one size; a third less pressure makes half of it
-DEPARTS = 0.01
+MAX_WHEEL_DIFFERENCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +34,12 @@ class Wheel:
     x: float | None = None   # m, ahead, of a steered wheel; None: it does not steer
     x_sigma: float | None = None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return its entry of calibration.json."""
-        return {key: value for key, value in asdict(self).items() if value is not None}
-
 
 def wheel_details(wheels: Mapping[str, Wheel]) -> dict[str, Any]:
     """Return the entry of the wheels in calibration.json, {} for one counter."""
-    return {'wheels': {name: wheel.as_dict() for name, wheel in wheels.items()}} if wheels else {}
+    entries = {name: {key: value for key, value in asdict(wheel).items() if value is not None}
+               for name, wheel in wheels.items()}
+    return {'wheels': entries} if wheels else {}
 
 
 def unknown_wheels(names: Iterable[str], scale_unit: str) -> dict[str, Estimate]:
@@ -53,7 +50,7 @@ def unknown_wheels(names: Iterable[str], scale_unit: str) -> dict[str, Estimate]
 
 
 def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Estimate,
-                    config: Config) -> Found:
+                    config: Config) -> tuple[dict[str, Estimate], list[Reason]]:
     """
     Return the estimates of several wheels and the reasons, docs/method.md (W4), (W8).
 
@@ -76,13 +73,13 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
         value = scale.value * wheel.ratio
         relative = np.hypot(scale.sigma / scale.value, wheel.ratio_sigma)
         estimates[FACTOR + name] = Estimate(value, float(value * relative), scale.unit)
-    reasons = _departing(wheels)
+    reasons = _different_wheel_reasons(wheels)
     for width, (left, right) in _widths(names).items():
         estimates[width], width_reasons = _track_width(wheels[left], wheels[right],
                                                        config.odometer.track_width)
         reasons += width_reasons
         if (left, right) != SIDES and estimates[width].value is not None:
-            estimates |= _places({name: wheels[name] for name in (left, right)})
+            estimates |= _positions({name: wheels[name] for name in (left, right)})
     return estimates, reasons
 
 
@@ -92,7 +89,7 @@ def _widths(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {'_'.join(('track_width', *(axle if axle != SIDES else ()))): axle for axle in axles}
 
 
-def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
+def _positions(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
     """Return the positions of the wheels of an axle, m to the left and ahead of the mean."""
     estimates = {f'lateral_position_{name}': Estimate(wheel.y, wheel.y_sigma, 'm')
                  for name, wheel in axle.items()}
@@ -100,14 +97,14 @@ def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
                         for name, wheel in axle.items() if wheel.x is not None}
 
 
-def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
-    """Return the reason that reports a wheel whose factor differs from all others."""
+def _different_wheel_reasons(wheels: Mapping[str, Wheel]) -> list[Reason]:
+    """Return the reason for a single wheel whose factor differs from all others."""
     if len(wheels) < MIN_COMPARED_WHEELS:
         return []
     differing = {}
     for name, wheel in wheels.items():
         others = float(np.median([w.ratio for other, w in wheels.items() if other != name]))
-        limit = max(DEPARTS, levels.FAULT_SIGMAS * wheel.ratio_sigma)
+        limit = max(MAX_WHEEL_DIFFERENCE, levels.FAULT_SIGMAS * wheel.ratio_sigma)
         if abs(wheel.ratio / others - 1) > limit:
             differing[name] = wheel.ratio / others - 1, limit
     return [Reason(Code.WHEEL_DEPARTS, f'the factor of wheel {name} is {100 * abs(x):.2f} % '
@@ -121,26 +118,26 @@ def _track_width(left: Wheel, right: Wheel,
                  configured: float) -> tuple[Estimate, list[Reason]]:
     """Return the track width and its reasons, (W8); configured : m, 0: unknown."""
     width, sigma = left.y - right.y, left.y_sigma + right.y_sigma
-    none = Estimate(None, None, 'm')
+    unknown = Estimate(None, None, 'm')
     if configured and sigma >= levels.INFORMED_SHARE * TRACK_WIDTH.taped_share * configured:
-        return none, []         # the configured width is more accurate
+        return unknown, []         # the configured width is more accurate
     if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
-        return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
+        return unknown, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
                              f'match the gyro turns: the track width would be {width:.2g} m; '
                              f'the lower limit is {TRACK_WIDTH.least:g} m',
                              'Check that odometer.left and odometer.right are the wheels of one '
                              'axle, or set odometer.track_width.')]
     limit = TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least)
     if sigma >= limit:
-        return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
+        return unknown, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
                              f'{sigma:.2g} m; the limit is {limit:.2g} m. Likely cause: too few '
                              'turns')]
-    far = levels.REMARK_SIGMAS * float(np.hypot(TRACK_WIDTH.taped_share * configured, sigma))
-    if configured and abs(width - configured) > far:
+    limit = levels.REMARK_SIGMAS * float(np.hypot(TRACK_WIDTH.taped_share * configured, sigma))
+    if configured and abs(width - configured) > limit:
         return Estimate(width, sigma, 'm'), [Reason(
             Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.3f} ± '
             f'{sigma:.2g} m; odometer.track_width is {configured:.4g} m; the limit of the '
-            f'difference is {far:.2g} m')]
+            f'difference is {limit:.2g} m')]
     return Estimate(width, sigma, 'm'), []
 
 
