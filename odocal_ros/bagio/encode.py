@@ -113,11 +113,7 @@ def _diagonal(variance: Floats, size: int = 3) -> Callable[[slice], Floats]:
 
 def imu(name: str, samples: data.ImuSamples, frame: str = 'imu_link',
         w_variance: Floats | None = None, f_variance: Floats | None = None) -> Topic:
-    """
-    Return sensor_msgs/Imu of ImuSamples; without orientation if the yaw variance is NaN.
-
-    w_variance, f_variance : (n, 3), optional, of turn rates and forces; default zeros: unknown.
-    """
+    """Return sensor_msgs/Imu, without orientation if its variance is NaN; variances : (n, 3)."""
     covariances = {f'{field}_covariance': _diagonal(variance) for field, variance in (
         ('angular_velocity', w_variance), ('linear_acceleration', f_variance))
         if variance is not None}

@@ -100,7 +100,7 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
 
 def robot_of(options: SimOptions) -> Robot:
     """Return robot and reference of a simulated drive."""
-    usual = dict(REFERENCES[options.reference].usual)
+    usual = dict(REFERENCES[options.reference].options)
     drift, length = usual.get('reference_drift', 0.0), usual.get('drift_length', 0.0)
     # the sigma of a correlated error; for a random walk that of the model with the same increments
     stationary = drift * np.sqrt((length or Robot.drift_length) / 2)

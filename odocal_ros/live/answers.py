@@ -72,7 +72,7 @@ def provisional_answer(at_stop: SessionView) -> str:
 
 def restored_answer(result: Restored, unit: str, within_limits: str) -> tuple[bool, str]:
     """Return (success, text) of a restored result; ``unit`` is that of its scale."""
-    return result.valid, _sentences([f'no leg is running; {result.words(unit)}', within_limits,
+    return result.valid, _sentences([f'no leg is running; {result.as_text(unit)}', within_limits,
                                      'Next: drive a leg to update it'])
 
 

@@ -52,11 +52,7 @@ class TopicReport:
         self._reported_duplicates: set[str] = set()
 
     def new_texts(self, lost: dict[str, int], duplicate_publishers: list[str]) -> list[str]:
-        """
-        Return the sentences on new losses, and new sentences of ``duplicate_publishers``.
-
-        lost : topic -> messages lost so far; a smaller number than before starts a new count.
-        """
+        """Return new sentences on losses and publishers; lost : messages by topic so far."""
         texts = [text for text in dict.fromkeys(duplicate_publishers) if text
                  and text not in self._reported_duplicates]
         self._reported_duplicates.update(texts)
@@ -78,11 +74,7 @@ def losses_text(lost: dict[str, int]) -> str:
 
 
 class Console:
-    """
-    Logs changes of the status, and repeats missing inputs at growing intervals.
-
-    ``report`` receives every view, with the time of a steady clock, ns.
-    """
+    """Logs changes of the status, and repeats missing inputs at growing intervals."""
 
     def __init__(self, log: PlainLog) -> None:
         self._log = log

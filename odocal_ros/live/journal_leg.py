@@ -58,11 +58,7 @@ def folder_size(folder: Path) -> int:
 
 
 def make_room(root: Path, limit: int, needed: int = 0) -> int:
-    """
-    Delete the oldest journals until the rest and ``needed`` more bytes are within the limit.
-
-    Journals in use are kept. Returns the remaining size, bytes.
-    """
+    """Delete the oldest unused journals for ``needed`` more bytes; return the size of the rest."""
     sizes = {folder: folder_size(folder) for folder in journal_folders(root)}
     for folder in list(sizes):
         if sum(sizes.values()) + needed <= limit:

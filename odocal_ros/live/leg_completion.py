@@ -128,7 +128,7 @@ class LegCompletion:
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
             self._log.warning(f'{jump}: leg {self.session.leg_id} is cancelled')
             self._drop_leg(drop_cause='time jumped back')
-            self._log.warning(self._lost_leg_text())
+            self._log.warning(self._dropped_leg_text())
         else:
             self._log.warning(f'{jump}: all samples so far are dropped')
         self._recording.restart()
@@ -159,8 +159,8 @@ class LegCompletion:
             observability=self._observability if in_leg else None,
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
-            stage=self._active_job.stage, saved=self._saver.saved, lost_leg=self._lost_leg_text(),
-            save_error=self._saver.error, journal=self._journal.folder,
+            stage=self._active_job.stage, saved=self._saver.saved, save_error=self._saver.error,
+            dropped_leg=self._dropped_leg_text(), journal=self._journal.folder,
             journal_error=self._journal.error, has_received=recording.has_received(),
             is_local=recording.is_local, has_imu=not inputs.without_imu)
 
@@ -277,7 +277,7 @@ class LegCompletion:
         self._active_job.answer(success, text)
         return success, text
 
-    def _lost_leg_text(self) -> str:
+    def _dropped_leg_text(self) -> str:
         """Return the text on a leg that was dropped automatically, empty without one."""
         session = self.session
         return session.drop_cause and (
@@ -292,7 +292,7 @@ class LegCompletion:
         self._active_job.drop()
         self.show_status()
         self._journal.end()
-        self._active_job.answer(False, text or self._lost_leg_text())
+        self._active_job.answer(False, text or self._dropped_leg_text())
 
     def _save(self, calibration: Calibration, by_operator: bool = False) -> Future:
         inputs = self._recording.inputs

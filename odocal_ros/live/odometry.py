@@ -111,7 +111,7 @@ class OdometryNode(CheckedNode):
         self._send_transform = self._transform_sender() if self.config.publish_tf else None
         self._due_ns = self._reckoned_ns = 0      # next possible pose, last computation
         self._timer = self.steady_timer(CHECK_PERIOD_S, self._run_cycle)
-        self.get_logger().info(f'applies the {calibration.words("")}')
+        self.get_logger().info(f'applies the {calibration.as_text("")}')
 
     def spin(self, executor: Executor) -> None:
         """Take messages when a pose may be due; the executor handles the rest at a low rate."""

@@ -31,11 +31,7 @@ MARK_STILL_S = 2 * HALF_MARK + 0.5
 
 
 class AutomaticLegs(LegCompletion):
-    """
-    Starts and ends legs automatically, at the standstills that ``LegSearch`` finds.
-
-    A leg of the operator takes precedence; the search continues after it.
-    """
+    """Starts and ends legs at standstills, unless a leg of the operator is running."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -184,8 +180,8 @@ class Operation(AutomaticLegs):
 
     def _last_result(self) -> tuple[bool, str]:
         session, view = self.session, self.view()
-        if view.lost_leg:
-            raise Refused(view.lost_leg)
+        if view.dropped_leg:
+            raise Refused(view.dropped_leg)
         within_limits = quantities_text(answers.quantities_ok(view))
         if session.calibration is not None:
             success, text = answers.result_answer(session.calibration, within_limits=within_limits,
@@ -218,7 +214,7 @@ class Operation(AutomaticLegs):
             return True, f'{text}; no leg is left'
 
         def handle(outcome: tuple[Calibration, worker.Paths]) -> None:
-            self.session.settle(outcome[0])
+            self.session.set_result(outcome[0])
             self._publish_result(*outcome)
 
         self._active_job.submit(

@@ -131,12 +131,12 @@ def _init(args: list[str] | None) -> None:
     """Start rclpy; an error raises an exception, without rcl's own line on stderr."""
     sys.stderr.flush()
     stderr = os.dup(2)
-    with tempfile.TemporaryFile() as held:
-        os.dup2(held.fileno(), 2)
+    with tempfile.TemporaryFile() as buffer:
+        os.dup2(buffer.fileno(), 2)
         try:
             rclpy.init(args=args)
-            held.seek(0)
-            os.write(stderr, held.read())
+            buffer.seek(0)
+            os.write(stderr, buffer.read())
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)

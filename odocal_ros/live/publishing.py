@@ -85,7 +85,7 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'not_observable': '; '.join(known.not_observable) if known else '',
         'messages_lost': sum(view.lost_messages.values()),
         'missing': '; '.join(view.missing), 'reasons': ','.join(r.code.name for r in reasons),
-        'saved': view.saved, 'save_error': view.save_error, 'lost': view.lost_leg,
+        'saved': view.saved, 'save_error': view.save_error, 'lost': view.dropped_leg,
         'automatic': _automatic(view), 'unused': _unused(session),
         'carried_legs': session.carried.legs if session.carried else 0,
         'journal': view.journal, 'journal_error': view.journal_error,
@@ -129,7 +129,7 @@ def level(view: SessionView) -> Any:
     has_warning = (
         state is State.CALIBRATED and view.session.verdict() != Verdict.ACCEPTED.value
         or view.missing or view.clocks or view.journal_error or view.save_error
-        or view.lost_leg or view.faults or view.duplicate_publishers or _changes(view.session)
+        or view.dropped_leg or view.faults or view.duplicate_publishers or _changes(view.session)
         or unused and unused.code not in SHORT_MOVE_CODES)
     return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
 
@@ -156,7 +156,7 @@ def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
     errors = [f'{statement}: {error}' for statement, error in (
         ('the result is not saved', view.save_error),
         ('the journal cannot be written', view.journal_error)) if error]
-    return '; '.join(filter(None, (state_text, *_changes(session), within_limits, view.lost_leg,
+    return '; '.join(filter(None, (state_text, *_changes(session), within_limits, view.dropped_leg,
                                    hint, _unused(session), *view.duplicate_publishers,
                                    losses_text(view.lost_messages), *errors)))
 

@@ -25,9 +25,9 @@ from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement, to bound memory: newest legs that keep their tracks, for plots (with leg.automatic,
-# older ones are released); number of legs of the operator from which the oldest is released
-LEGS_HELD, MARKED_LEGS_HELD = 20, 50
+# judgement, to bound memory: the newest legs that keep their tracks, for plots; with leg.automatic
+# older ones are released, legs of the operator beyond the second number
+LEGS_WITH_TRACKS, MAX_OPERATOR_LEGS = 20, 50
 
 
 class Refused(OdocalError):
@@ -65,7 +65,7 @@ class Restored:
     stamp: str
     vehicle: str = ''
 
-    def words(self, unit: str) -> str:
+    def as_text(self, unit: str) -> str:
         """Return the result as a sentence; ``unit`` is that of the scale factors, or empty."""
         estimates = {name: replace(e, unit=unit) if unit and name.startswith('scale_factor') else e
                      for name, e in self.estimates.items()}
@@ -96,7 +96,7 @@ class Session:
         self.drop_cause = ''      # why the last leg was dropped automatically
         self.is_automatic = False      # leg.automatic started the last leg
         self.unused_reason: Reason | None = None      # why the last automatic leg is not used
-        # information of released legs, and of those of earlier runs of the node
+        # information of legs that are no longer kept, and of those of earlier runs of the node
         self.carried: CarriedInformation | None = None
         self.marks: list[FloorMark] = []       # on reference.points, since the last leg's pre-roll
         self._last_id = 0
@@ -155,17 +155,17 @@ class Session:
     def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
         """Keep the computed leg; ``calibration`` combines all kept legs."""
         self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, results))
-        if len(self.legs) > LEGS_HELD:
-            old = self.legs[-LEGS_HELD - 1]
-            self.legs[-LEGS_HELD - 1] = replace(
-                old, results=tuple(result.without_plot_data() for result in old.results))
+        if len(self.legs) > LEGS_WITH_TRACKS:
+            k = -LEGS_WITH_TRACKS - 1
+            self.legs[k] = replace(self.legs[k], results=tuple(
+                result.without_plot_data() for result in self.legs[k].results))
         self.unused_reason = None
-        self.settle(calibration)
+        self.set_result(calibration)
 
     def drop_unusable(self, reason: Reason) -> None:
         """Drop the computed automatic leg, which is not usable."""
         self.event, self.unused_reason = 'cancelled', reason
-        self.settle(self.calibration)
+        self.set_result(self.calibration)
 
     def set_carried(self, carried: CarriedInformation | None, released: int) -> None:
         """Release this number of the oldest kept legs; ``carried`` has their information."""
@@ -181,7 +181,7 @@ class Session:
             raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept '
                           'leg')
         self.event, self.drop_cause = 'cancelled', drop_cause
-        self.settle(self.calibration)
+        self.set_result(self.calibration)
 
     def begin_undo(self) -> list[KeptLeg]:
         """Drop the last kept leg and return those left, which must be combined again."""
@@ -227,7 +227,7 @@ class Session:
         """Return the verdict in force, empty before the first."""
         return self.calibration.verdict.value if self.calibration else ''
 
-    def settle(self, calibration: Calibration | None) -> None:
+    def set_result(self, calibration: Calibration | None) -> None:
         """Set the combined result of the kept legs, None without one; no leg is open then."""
         self.calibration, self.failure = calibration, ''
         if calibration is None:
@@ -262,7 +262,7 @@ class SessionView:
     forecast_age_s: float = nan                 # since its newest sample
     stage: Stage = Stage()                      # progress of the computation
     saved: str = ''                             # folder of the newest saved result
-    lost_leg: str = ''                          # text on a leg that was dropped automatically
+    dropped_leg: str = ''                       # text on a leg that was dropped automatically
     save_error: str = ''                        # why the newest result is not saved
     journal: str = ''                           # folder of the newest leg's journal
     journal_error: str = ''                     # why it cannot be written

@@ -26,7 +26,7 @@ from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.live import answers
-from odocal_ros.live.session import LEGS_HELD, MARKED_LEGS_HELD
+from odocal_ros.live.session import LEGS_WITH_TRACKS, MAX_OPERATOR_LEGS
 from odocal_ros.output.plot_style import even_rows
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import add_to_carried, rejecting_reason
@@ -92,7 +92,8 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     if is_automatic and (reason := rejecting_reason(results[0])):
         return UnusedLeg(results, reason)
     paths = leg_paths(max(results, key=lambda result: result.distance), config)
-    released = max(0, len(kept_results) + 1 - (LEGS_HELD if is_automatic else MARKED_LEGS_HELD))
+    max_legs = LEGS_WITH_TRACKS if is_automatic else MAX_OPERATOR_LEGS
+    released = max(0, len(kept_results) + 1 - max_legs)
     new_carried = add_to_carried(
         [result for leg in kept_results[:released] for result in leg], config, carried)
     # results of the two-point method cannot be added to ``carried``: all legs are kept

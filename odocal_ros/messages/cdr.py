@@ -142,11 +142,7 @@ class Layout:
         return self._adjacent[paths]
 
     def columns(self, table: NDArray[np.uint8], paths: Sequence[str]) -> NDArray[Any] | None:
-        """
-        Return the values at some paths of messages of this layout, (n, size) bytes.
-
-        The array is (n, len(paths)) of the first path's type; None if a path is missing.
-        """
+        """Return values of messages, (n, size) bytes: (n, paths); None if a path is missing."""
         runs = self._places(tuple(paths))
         if runs is None:
             return None

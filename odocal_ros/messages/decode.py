@@ -238,11 +238,7 @@ class Reader:
 
 
 def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
-    """
-    Return the reader of a slot for messages of a type.
-
-    Raises BadData, BadConfig: the type cannot be used for this slot, or with these settings.
-    """
+    """Return the reader of a type for a slot; raise BadData, BadConfig if it cannot be used."""
     msgtype = full_type(msgtype)
     if slot == 'fix' and msgtype == TRANSFORMS:
         from odocal_ros.messages.transforms import TransformReader

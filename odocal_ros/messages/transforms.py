@@ -27,11 +27,7 @@ Transform = tuple[str, str, int, tuple[float, ...]]     # child, parent, stamp n
 
 
 def transforms_of(raw: bytes, deserialize: Callable[[bytes], Any]) -> list[Transform]:
-    """
-    Return the transforms of a TFMessage: x y z, m, and quaternion x y z w of child in parent.
-
-    Raises an exception if the message is damaged.
-    """
+    """Return the transforms of a TFMessage: x y z, m, quaternion x y z w; may raise any error."""
     if raw[:2] != b'\0\1':      # XCDR1, little endian
         return [(_name(message.child_frame_id), _name(message.header.frame_id),
                  message.header.stamp.sec * 10**9 + message.header.stamp.nanosec,

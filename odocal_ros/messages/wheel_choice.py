@@ -39,11 +39,7 @@ class Choice:
 
 
 def select_wheels(names: Sequence[str], count: int) -> Choice | str:
-    """
-    Return the wheels among the values of a message, or the reason why they are unclear.
-
-    names : of the values, in order; may be fewer than the values, or none.   count : of values.
-    """
+    """Return the wheels among ``count`` values, or why they are unclear; names : [] if none."""
     names = list(names[:count])
     keys = names or [str(k) for k in range(count)]
     if not keys:

@@ -29,9 +29,9 @@ FOREIGN_PARAMETERS = re.compile(
 TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
 WHOLE_NUMBER = re.compile(r'[-+]?(?:(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*)')
-MAX_NUMBER_LENGTH = 100        # judgement: characters of a number
+MAX_LENGTH = 100        # judgement: characters of a number, or of a node's key
 Node = Any           # of PyYAML
-DOTTED = re.compile(r'([-+]?)\.(inf|Inf|INF|nan|NaN|NAN)')
+INF_OR_NAN = re.compile(r'([-+]?)\.(inf|Inf|INF|nan|NaN|NAN)')
 
 
 def read_config_file(path: Path) -> dict[str, object]:
@@ -63,8 +63,8 @@ def _settings(path: Path, root: Node) -> dict[str, object]:
         raise BadConfig(f'{path}: no block for the calibrator{found_keys}; required: a top-level '
                         f'key {VALID_KEYS} that contains {PARAMETERS}')
     values: dict[str, object] = {}
-    for name, node in (pair for block in matching for part in block
-                       for pair in _dotted_values(part, '')):
+    for name, node in (pair for block in matching for mapping in block
+                       for pair in _dotted_values(mapping, '')):
         if not FOREIGN_PARAMETERS.match(name):
             where = f'{path}, line {node.start_mark.line + 1}: '
             values[name] = _check_value(name, _value(node), where)
@@ -72,12 +72,11 @@ def _settings(path: Path, root: Node) -> dict[str, object]:
 
 
 def read_journal_file(path: Path, block: str) -> tuple[dict[str, object], dict[str, str]]:
-    """Return the settings of a journal's file, and the values of its own block as text."""
+    """Return the settings of a journal's file, and the values of one other block as text."""
     root = _root(path)
-    about = list(_blocks(root, '').get(block, ()))
     return _settings(path, root), {
-        name: node.value for part in about for name, node in _dotted_values(part, '')
-        if isinstance(node.value, str)}
+        name: node.value for mapping in _blocks(root, '').get(block, ())
+        for name, node in _dotted_values(mapping, '') if isinstance(node.value, str)}
 
 
 def parse_set(text: str) -> tuple[str, object]:
@@ -115,28 +114,25 @@ def _pairs(node: Node) -> list[tuple[str, Node]]:
 
 
 def _blocks(node: Node, prefix: str) -> dict[str, list[Node]]:
-    """
-    Return the parameter mappings by node key; namespaces may be nested.
-
-    A repeated key is added to the block of its first appearance, as in rcl.
-    """
+    """Return the parameter mappings by node key; a repeated key continues its block, as in rcl."""
     blocks: dict[str, list[Node]] = {}
     for key, value in _pairs(node):
         if key == PARAMETERS and prefix:
             blocks.setdefault(prefix, []).append(value)
         elif isinstance(key, str):
             name = f'{prefix}/{key}' if prefix else key
-            for deeper, mappings in _blocks(value, name).items():
-                blocks.setdefault(deeper, []).extend(mappings)
+            for node_key, mappings in _blocks(value, name).items():
+                blocks.setdefault(node_key, []).extend(mappings)
     return blocks
 
 
 def _matches_calibrator(key: str) -> bool:
     """Return True if a node key, with the wildcards * and **, matches /calibrator."""
-    if len(key) > MAX_NUMBER_LENGTH:
+    if len(key) > MAX_LENGTH:
         return False
-    parts = {'**': r'(?:/\w+)*', '*': r'/\w+'}
-    pattern = ''.join(parts.get(p, '/' + re.escape(p)) for p in key.strip('/').split('/'))
+    wildcards = {'**': r'(?:/\w+)*', '*': r'/\w+'}
+    pattern = ''.join(wildcards.get(part, '/' + re.escape(part))
+                      for part in key.strip('/').split('/'))
     return re.fullmatch(pattern, NODE) is not None
 
 
@@ -164,15 +160,15 @@ def scalar(text: str) -> bool | int | float | str:
     """Return a plain scalar with the type that rcl gives it (measured on rcl 9.2)."""
     if text in TRUE or text in FALSE:
         return text in TRUE
-    if len(text) > MAX_NUMBER_LENGTH:
+    if len(text) > MAX_LENGTH:
         return text
     if match := WHOLE_NUMBER.fullmatch(text):
         number = int(text, 16 if match[1] else 8 if match[2] else 10)
         if -2**63 <= number < 2**63:
             return number
-    dotted = DOTTED.fullmatch(text)
+    special = INF_OR_NAN.fullmatch(text)      # Python has no dot in them
     try:
-        return float(dotted[1] + dotted[2] if dotted else text) if '_' not in text else text
+        return float(special[1] + special[2] if special else text) if '_' not in text else text
     except ValueError:
         return text
 

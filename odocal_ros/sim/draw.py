@@ -20,7 +20,7 @@ from odocal_ros.sim.draw_effects import EFFECTS, RARE
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real_effects import RealEffects
-from odocal_ros.sim.zoo import flat, GRADES, TUPLES_BY_GRADE, VALUES_BY_GRADE, Vehicle
+from odocal_ros.sim.zoo import BY_GRADE, flat, GRADES, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')    # scenarios of the zoo
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each defines the only odometer
@@ -56,7 +56,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     options |= fixed_options
     if effects is None:
         odometer_effect = ('', 'coarse_pulses', 'coarse_speed')[int(make_rng(
-            seed, 'vehicle odometer').choice(3, p=vehicle.grade_values('odometers')))]
+            seed, 'vehicle odometer').choice(3, p=vehicle.grade_value('odometers')))]
         names = [n for n in names if n not in ODOMETER_EFFECTS or n == odometer_effect]
     real: dict[str, Any] = {}
     present_effects = []
@@ -75,10 +75,10 @@ def _ideal_vehicle(seed: int, kind: str, grade: str,
     """Return a drawn vehicle and its SimOptions before any effect; numbers: docs/zoo.md."""
     rng, grade_index = make_rng(seed, 'vehicle'), GRADES.index(grade)
     roll, pitch, yaw = (math.radians(sigma) * rng.standard_normal()
-                        for sigma in TUPLES_BY_GRADE['mounting'][grade_index])
+                        for sigma in BY_GRADE['mounting'][grade_index])
     heading, slope = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.02)
     nominal_quarter_turns = int(rng.integers(1, 4)) if rng.uniform() < 0.2 else 0
-    rtk = bool(rng.uniform() < VALUES_BY_GRADE['rtk'][grade_index])
+    rtk = bool(rng.uniform() < BY_GRADE['rtk'][grade_index])
     city = bool(rng.uniform() < 0.45)
     robot = kind == 'yard' and grade == 'consumer'
     size = 0.5 if robot else 1.0
@@ -86,7 +86,7 @@ def _ideal_vehicle(seed: int, kind: str, grade: str,
     imu = size * rng.normal((0.8, 0.0, 0.4), (0.6, 0.3, 0.2))
     scale = 1 / (500.0 if robot else 1000.0)     # m/pulse, fine; ODOMETER_EFFECTS are coarser
     fix_rate = float(rng.choice([1.0, 5.0, 10.0]))
-    scale_error = VALUES_BY_GRADE['nominal scale'][grade_index] * rng.standard_normal()
+    scale_error = BY_GRADE['nominal scale'][grade_index] * rng.standard_normal()
     options: dict[str, Any] = {
         'scenario': kind, 'seed': seed, 'imu_grade': grade, 'heading': heading, 'slope': slope,
         'roll': roll, 'pitch': float(np.clip(pitch, -0.2, 0.2)), 'yaw': yaw,

@@ -15,11 +15,14 @@ import numpy as np
 from odocal_ros.settings.nominal import GRADES
 from odocal_ros.sim.zoo import DEG, Effect, flat, G, KMH, lognormal, MG, Vehicle
 
+# judgement: turn-on bias of the accelerometer's axes over that of the grade (docs/zoo.md)
+AXIS_RATIOS = [1, 1, 1.3]
+
 
 def triads(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Draw scale and misalignment of each axis, and a rotation between gyro and accelerometer."""
     x, y, z = rng.normal(0.0, vehicle.grade_value('triad rotation') / math.sqrt(2), 3)
-    # the rotation, is split: half of its variance to each triad
+    # each triad has half of the variance of the rotation
     rotation = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     real = {}
     for name, sensor, sign in (('gyro_matrix', 'gyro', 1), ('accel_matrix', 'accelerometer', -1)):
@@ -43,7 +46,7 @@ def bias(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     return Effect(real={
         'gyro_bias': flat(rng.normal(0.0, vehicle.grade_value('gyro bias'), 3)),
         'accel_bias': flat(
-            rng.normal(0.0, vehicle.grade_value('accelerometer bias'), 3) * [1, 1, 1.3]),
+            rng.normal(0.0, vehicle.grade_value('accelerometer bias'), 3) * AXIS_RATIOS),
         'gyro_wander': vehicle.grade_value('gyro wander'),
         'accel_wander': vehicle.grade_value('accelerometer wander')})
 
@@ -54,10 +57,10 @@ def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     time_on = rng.uniform(0.0, 600.0)
     real = {}
     for name, sensor in (('gyro_slope', 'gyro'), ('accel_slope', 'accelerometer')):
-        median, log_sigma = vehicle.grade_values(f'{sensor} slope')
+        median, log_sigma = vehicle.grade_value(f'{sensor} slope')
         sign = rng.choice([-1, 1], 3)
         real[name] = flat(sign * (median * np.exp(log_sigma * rng.standard_normal(3))))
-    lowest, highest = vehicle.grade_values('temperature rise')
+    lowest, highest = vehicle.grade_value('temperature rise')
     rise = rng.uniform(lowest, highest) * math.exp(-time_on / tau)
     return Effect(real=real | {'warm_rise': float(rise), 'warm_time': tau})
 
@@ -72,8 +75,8 @@ def vibration(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
 
 def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Delay stamps by filter and transport, with jitter, in batches."""
-    shortest, longest = vehicle.grade_values('filter')
-    latency = rng.uniform(shortest, longest) + lognormal(rng, *vehicle.grade_values('latency'))
+    shortest, longest = vehicle.grade_value('filter')
+    latency = rng.uniform(shortest, longest) + lognormal(rng, *vehicle.grade_value('latency'))
     batches = vehicle.grade == 'industrial' and rng.uniform() < 0.3
     return Effect(real={
         'imu_latency': float(latency), 'imu_jitter': vehicle.grade_value('imu jitter'),
@@ -95,8 +98,8 @@ def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     resolutions = (0.0075, 0.01, 0.031, 0.056, 0.06)     # km/h, of vehicle buses
     real = {'speed_step': KMH * (1.0 if whole_kmh else float(rng.choice(resolutions))),
             'speed_rounding': str(rng.choice(['floor', 'round']))}
-    u = rng.uniform()
-    band_kmh = 0.0 if u < 0.3 else rng.uniform(0.3, 1) if u < 0.8 else rng.uniform(1, 3.5)
+    draw = rng.uniform()      # of ten vehicles three have no dead band, two a large one
+    band_kmh = 0.0 if draw < 0.3 else rng.uniform(0.3, 1) if draw < 0.8 else rng.uniform(1, 3.5)
     rate = float(rng.choice([1.0, 2.0, 5.0, 10.0] if whole_kmh else [10.0, 20.0, 50.0]))
     return Effect(real=real | {'dead_band': 0.0 if whole_kmh else band_kmh * KMH},
                   options=vehicle.speed_options | {'odometer_rate': rate})

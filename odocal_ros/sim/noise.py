@@ -39,13 +39,13 @@ def random_walk(rng: np.random.Generator, root_rate: float, rate: float,
 def gauss_markov(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
     """Return a stationary first-order Gauss-Markov process in three axes: (n,) s to (n, 3)."""
     decay = np.exp(-np.diff(t, prepend=t[:1]) / tau)
-    drive = sigma * np.sqrt(1 - decay**2)[:, None] * rng.standard_normal((len(t), 3))
-    drive[:1] = sigma * rng.standard_normal((1, 3))
-    x: Floats = np.empty_like(drive)
-    last = np.zeros(3)
-    for k, (share, disturbance) in enumerate(zip(decay, drive, strict=True)):
-        x[k] = last = share * last + disturbance
-    return x
+    disturbances = sigma * np.sqrt(1 - decay**2)[:, None] * rng.standard_normal((len(t), 3))
+    disturbances[:1] = sigma * rng.standard_normal((1, 3))
+    values: Floats = np.empty_like(disturbances)
+    value = np.zeros(3)
+    for k, disturbance in enumerate(disturbances):
+        values[k] = value = decay[k] * value + disturbance
+    return values
 
 
 def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floats]:

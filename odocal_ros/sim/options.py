@@ -15,7 +15,7 @@ from typing import Any
 from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, MECANUM, MIN_OMNI_WHEELS, OMNI
 from odocal_ros.settings.nominal import Grade, GRADES
-from odocal_ros.sim.real_effects import NONE3, RealEffects, Vector
+from odocal_ros.sim.real_effects import RealEffects, Vector, ZEROS3
 
 SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
@@ -30,19 +30,19 @@ class Reference:
 
     topic: str
     encoder: str            # function of ``bagio.encode``
-    planar: bool = False    # z is 0, as of 2D SLAM
-    stated: bool = False    # with a covariance
-    usual: dict[str, Any] = field(default_factory=dict)    # SimOptions of this kind
+    is_planar: bool = False         # z is 0, as of 2D SLAM
+    has_covariance: bool = False
+    options: dict[str, Any] = field(default_factory=dict)      # usual SimOptions of this kind
 
 
 # Judgement, by data sheets and documentation: motion capture 0.1 to 1 mm at 50 to 200 Hz; total
 # stations that track a prism 1 to 5 mm; laser scanners 1 to 3 cm of noise, and scan matching that
 # drifts by 0.5 to 1 % of a path of some metres; AMCL with the grid of its map, 5 cm
 REFERENCES = {
-    'fix': Reference('/fix', 'fix', stated=True),
+    'fix': Reference('/fix', 'fix', has_covariance=True),
     'pose': Reference('/pose', 'pose'),
-    'mocap': Reference('/mocap/pose', 'pose', usual={'fix_sigma': 0.001, 'fix_rate': 50.0}),
-    'total_station': Reference('/prism', 'point', usual={'fix_sigma': 0.002, 'fix_rate': 10.0}),
+    'mocap': Reference('/mocap/pose', 'pose', options={'fix_sigma': 0.001, 'fix_rate': 50.0}),
+    'total_station': Reference('/prism', 'point', options={'fix_sigma': 0.002, 'fix_rate': 10.0}),
     'slam': Reference('/slam/pose', 'pose_with_covariance', True, True, {
         'fix_sigma': 0.02, 'fix_rate': 10.0, 'reference_drift': 0.01, 'closure_time': 30.0}),
     'amcl': Reference('/amcl_pose', 'pose_with_covariance', True, True, {
@@ -76,8 +76,8 @@ class SimOptions:
     yaw: float = BY_SCENARIO               # rad, yaw mounting angle
     pitch: float = BY_SCENARIO             # rad, pitch mounting angle
     roll: float = 0.0                      # rad
-    mounting_rpy: Vector = NONE3           # rad, nominal, IMU frame to b
-    imu_lever_arm: Vector = NONE3
+    mounting_rpy: Vector = ZEROS3           # rad, nominal, IMU frame to b
+    imu_lever_arm: Vector = ZEROS3
     gyro_scale_error: float = 0.0          # relative, of all axes
     accel_scale_error: float = 0.0         # relative, of all axes
     orientation_sigma: float | None = None  # rad; None: the IMU sends no orientation
@@ -85,7 +85,7 @@ class SimOptions:
     odometer: str = 'counts'               # counts, speed or angle (JointState position)
     odometer_rate: float = 50.0            # Hz
     odometer_delay: float = 0.0            # s, delay of the stamps
-    odometer_lever_arm: Vector = NONE3     # wheel contact point; of two wheels: their middle
+    odometer_lever_arm: Vector = ZEROS3     # wheel contact point; of two wheels: their middle
     scale: float = BY_SCENARIO             # m/pulse, 1 or m/rad: the true value
     nominal_scale: float = BY_SCENARIO     # K0, configured by the operator
     speed_noise: float = 0.0               # m/s, white, of kind speed
@@ -113,7 +113,7 @@ class SimOptions:
     drift_length: float = BY_SCENARIO      # m of path, correlation length; 0: random walk
     closure_time: float = BY_SCENARIO      # s, mean, between loop closures; 0: none
     fix_delay: float = 0.0                 # s, delay of the stamps
-    antenna_lever_arm: Vector = NONE3
+    antenna_lever_arm: Vector = ZEROS3
     outliers: float = 0.0                  # share of the fixes
     outlier_size: float = 20.0             # m
     outages: tuple[tuple[float, float], ...] = ()   # s from the start, no fixes in between
@@ -186,7 +186,7 @@ def resolved(options: SimOptions) -> SimOptions:
     _choice('--odometer', options.odometer, ODOMETERS)
     defaults: dict[str, Any] = COMMON_DEFAULTS | DEFAULTS[options.scenario]
     _choice('--reference', options.reference or defaults['reference'], REFERENCES)
-    defaults |= REFERENCES[options.reference or defaults['reference']].usual
+    defaults |= REFERENCES[options.reference or defaults['reference']].options
     options = _with_defaults(options, defaults)
     _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     _choice('--drive', options.drive, DRIVES)

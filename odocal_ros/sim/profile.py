@@ -153,6 +153,7 @@ class Hills:
         """Return the height by kerbs, m, and its three derivatives by distance: (4, n)."""
         out = np.zeros((4, *np.shape(travel)))
         for begin, height in self.kerbs:
+            # a smooth step of 7th order: slope, curvature and its change are 0 at both ends
             x = np.clip((travel - begin) / KERB_LENGTH, 0.0, 1.0)
             y = x * (1 - x)
             out += height * np.stack([

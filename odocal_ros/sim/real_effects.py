@@ -21,7 +21,7 @@ from odocal_ros.settings.nominal import GRADES
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row
-NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9    # definition
+ZEROS3, ZEROS9 = (0.0,) * 3, (0.0,) * 9    # definition
 CHOICES = {'speed_rounding': ('floor', 'round'), 'configured_grade': tuple(GRADES)}
 # names of parameters that may be negative; of those that are pairs; of those above 0
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_step',
@@ -44,16 +44,16 @@ class RealEffects:
     The IMU reads ``w_m = (I + M_g) w + b_g + G f + n`` and ``f_m = (I + M_a) f + b_a + n``.
     """
 
-    gyro_matrix: Matrix = NONE9      # M_g: scale on the diagonal, misalignment off it
-    accel_matrix: Matrix = NONE9     # M_a
-    g_sensitivity: Matrix = NONE9    # G, rad/s per m/s^2
+    gyro_matrix: Matrix = ZEROS9      # M_g: scale on the diagonal, misalignment off it
+    accel_matrix: Matrix = ZEROS9     # M_a
+    g_sensitivity: Matrix = ZEROS9    # G, rad/s per m/s^2
     gyro_bias: Vector | None = None  # rad/s at the first sample; None: drawn by the grade
     accel_bias: Vector | None = None   # m/s^2
-    gyro_step: Vector = NONE3        # rad/s, change of the bias at bias_step_at
-    accel_step: Vector = NONE3       # m/s^2
+    gyro_step: Vector = ZEROS3        # rad/s, change of the bias at bias_step_at
+    accel_step: Vector = ZEROS3       # m/s^2
     bias_step_at: float = 0.0        # s after the first sample
-    gyro_slope: Vector = NONE3       # rad/s per K
-    accel_slope: Vector = NONE3      # m/s^2 per K
+    gyro_slope: Vector = ZEROS3       # rad/s per K
+    accel_slope: Vector = ZEROS3      # m/s^2 per K
     warm_rise: float = 0.0           # K of warming after the first sample
     warm_time: float = 300.0         # s
     gyro_wander: float = 0.0         # rad/s, in-run instability, first order Markov
@@ -91,9 +91,9 @@ class RealEffects:
     cross_slope: float = 0.0         # rad, largest, alternating in side
     cross_slope_length: float = 20.0    # m, its wavelength
 
-    imu_arm_error: Vector = NONE3        # m, configured minus true
-    odometer_arm_error: Vector = NONE3
-    antenna_arm_error: Vector = NONE3
+    imu_arm_error: Vector = ZEROS3        # m, configured minus true
+    odometer_arm_error: Vector = ZEROS3
+    antenna_arm_error: Vector = ZEROS3
 
     receiver_lag: float = 0.0        # s, time constant of a first-order filter on positions
     receiver_tracking: float = 0.0   # s, time constant of a filter of position and velocity
@@ -140,12 +140,15 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
         raise BadUsage(f'--real {name}: required: finite numbers')
     smallest = min(numbers, default=1.0)
-    if (name not in SIGNED and smallest < 0 or name in POSITIVE and smallest <= 0
-            or name == 'drops' and smallest >= 1
-            or name == 'imu_batch' and smallest != int(smallest)):
-        limit = {'drops': '0 or more, below 1', 'imu_batch': 'a whole number, 1 or more'}.get(
-            name, 'above 0' if name in POSITIVE else '0 or more')
-        raise BadUsage(f'--real {name}={value}: required: {limit}')
+    is_valid, requirement = smallest >= 0 or name in SIGNED, '0 or more'
+    if name == 'drops':
+        is_valid, requirement = 0 <= smallest < 1, '0 or more, below 1'
+    elif name == 'imu_batch':
+        is_valid, requirement = smallest >= 1 and smallest % 1 == 0, 'a whole number, 1 or more'
+    elif name in POSITIVE:
+        is_valid, requirement = smallest > 0, 'above 0'
+    if not is_valid:
+        raise BadUsage(f'--real {name}={value}: required: {requirement}')
     return value
 
 

@@ -102,8 +102,8 @@ class Drive:
         """Return the drive as one leg between its marks, with all earlier samples."""
         fix = self.fix
         if self.options.reference != 'fix':
-            stated = [fix.covariance_n] if self.reference.stated else []
-            fix = local_fixes(np.nan)(fix.stamp_ns, fix.received_ns, self.positions(), *stated)
+            covariance = [fix.covariance_n] if self.reference.has_covariance else []
+            fix = local_fixes(np.nan)(fix.stamp_ns, fix.received_ns, self.positions(), *covariance)
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(self.truth.start_ns, self.truth.stop_ns, form=self.form).with_rows(
             imu=self.imu, fix=fix, heading=self.heading, fix_velocity=self.velocity,
@@ -115,7 +115,7 @@ class Drive:
         position_n = Origin(start.latitude, start.longitude, start.height).to_n(
             np.stack([self.fix.latitude, self.fix.longitude, self.fix.height], -1))
         position = position_n @ matrix_from_rpy([0.0, 0.0, float(yaw_from_heading(start.heading))])
-        if self.reference.planar:
+        if self.reference.is_planar:
             position[:, 2] = 0.0
         return position
 

@@ -33,7 +33,7 @@ from odocal_ros.sim.noise import (
     white,
 )
 from odocal_ros.sim.options import REFERENCES, SIM_GRADES, SimOptions
-from odocal_ros.sim.real_effects import NONE3
+from odocal_ros.sim.real_effects import ZEROS3
 
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
 WHITE_SHARE = 0.2        # judgement: of the correlated sigma: additional receiver noise
@@ -99,7 +99,7 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
 def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.HeadingSamples:
     """Return an external heading of b's x axis, as from a dual-antenna receiver."""
     ns, t = stamps(motion.duration, options.heading_rate, PHASE['heading'])
-    q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=NONE3), sigma, 'heading')
+    q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=ZEROS3), sigma, 'heading')
     stamp = options.start_ns + ns
     return samples.HeadingSamples(stamp, stamp + round(TRANSPORT_DELAY['heading'] * 1e9), q_nb,
                                   np.full(len(t), sigma**2))
@@ -231,7 +231,7 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     variance = (_axis_sigmas(options) ** 2 * variance_ratio + stationary_sigma(options)**2
                 + slow_variance * np.array([1.0, 1.0, real_sensors.UP_RATIO**2]))
     variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
-    if REFERENCES[options.reference].planar:
+    if REFERENCES[options.reference].is_planar:
         variance[2] = 0.0
     n = len(t)
     stamp = options.start_ns + _delayed(ns, options, 'fix')

@@ -19,8 +19,9 @@ GRADES = ('consumer', 'industrial', 'tactical')
 # definition: units of data sheets in SI; G as rounded there, far within any distribution here
 G, MG, DEG, DEG_H, KMH = 9.81, 9.81e-3, math.radians(1.0), math.radians(1.0) / 3600, 1 / 3.6
 
-# by grade, as in GRADES: a sigma (normal distribution), a share of the vehicles or a fixed value
-VALUES_BY_GRADE = {
+# by grade, as in GRADES: a sigma (normal distribution), a share of the vehicles or a fixed value;
+# of two numbers median and sigma of the logarithm, or as stated
+BY_GRADE: dict[str, tuple[Any, ...]] = {
     'gyro scale': (0.01, 1.5e-3, 3e-4),                                # relative, sigma
     'accelerometer scale': (0.01, 2e-3, 3e-4),
     'misalignment': (0.4 * DEG, 0.05 * DEG, 3e-4),                     # rad, of axes, sigma
@@ -36,9 +37,6 @@ VALUES_BY_GRADE = {
     'rtk': (0.1, 0.4, 0.9),                                            # share of the vehicles
     'lever arm error': (0.15, 0.03, 0.01),                             # m, each axis, sigma
     'unmeasured lever arms': (0.3, 0.1, 0.0),                          # share of the vehicles
-}
-# by grade: (median, sigma of the logarithm), or as stated
-TUPLES_BY_GRADE: dict[str, tuple[tuple[float, ...], ...]] = {
     'gyro slope': ((0.02 * DEG, 0.7), (0.002 * DEG, 0.5), (0.5 * DEG_H, 0.5)),     # rad/s per K
     'accelerometer slope': ((0.5 * MG, 0.5), (0.05 * MG, 0.5), (0.02 * MG, 0.5)),  # m/s^2 per K
     'temperature rise': ((5.0, 25.0), (3.0, 10.0), (3.0, 5.0)),        # K, range
@@ -69,13 +67,9 @@ class Vehicle:
     options: dict[str, Any]    # fields of SimOptions, before any effect
     effects_requested: bool    # by name: then each effect is present, not by chance
 
-    def grade_value(self, name: str) -> float:
-        """Return the entry of VALUES_BY_GRADE for the vehicle's grade."""
-        return VALUES_BY_GRADE[name][GRADES.index(self.grade)]
-
-    def grade_values(self, name: str) -> tuple[float, ...]:
-        """Return the entry of TUPLES_BY_GRADE for the vehicle's grade."""
-        return TUPLES_BY_GRADE[name][GRADES.index(self.grade)]
+    def grade_value(self, name: str) -> Any:
+        """Return the entry of BY_GRADE for the vehicle's grade."""
+        return BY_GRADE[name][GRADES.index(self.grade)]
 
     @property
     def speed_options(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import pytest
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.live import worker
-from odocal_ros.live.session import LEGS_HELD, Refused, Session, State
+from odocal_ros.live.session import LEGS_WITH_TRACKS, Refused, Session, State
 from odocal_ros.output.files import as_json
 from odocal_ros.output.program_files import geojson
 from odocal_ros.output.report import report_html
@@ -93,7 +93,7 @@ def test_undo_removes_the_last_leg_and_shows_its_marks():
         session.start(90, CONFIG)
     with pytest.raises(Refused, match='no leg is running'):
         session.cancel()
-    session.settle(calibration(Code.LEG_TOO_SHORT))
+    session.set_result(calibration(Code.LEG_TOO_SHORT))
     assert session.state is State.REJECTED
     assert session.begin_undo() == []
     assert (session.state, session.calibration) == (State.IDLE, None)
@@ -148,12 +148,12 @@ def town():
 
 def test_many_legs_keep_their_values_and_only_the_newest_their_tracks(town):
     (whole, config), session = town, Session()
-    for leg in range(LEGS_HELD + 2):
+    for leg in range(LEGS_WITH_TRACKS + 2):
         session.start(10 * leg + 1, CONFIG)
         session.stop(10 * leg + 5)
         session.finish((whole,), calibration())
     drawn = [leg.results[0].evidence is not None for leg in session.legs]
-    assert drawn == [False] * 2 + [True] * LEGS_HELD
+    assert drawn == [False] * 2 + [True] * LEGS_WITH_TRACKS
     bare = session.legs[0].results[0]
     later = replace(whole, start_ns=whole.stop_ns, stop_ns=2 * whole.stop_ns - whole.start_ns)
     full, both = (combine([first, later], config) for first in (whole, bare))
@@ -170,7 +170,7 @@ def test_released_legs_remain_in_the_result(town, monkeypatch):
     whole, config = town
     every = [replace(whole, methods=dict(whole.methods), start_ns=whole.start_ns + day * 10**14,
                      stop_ns=whole.stop_ns + day * 10**14) for day in range(4)]
-    monkeypatch.setattr(worker, 'MARKED_LEGS_HELD', 3)
+    monkeypatch.setattr(worker, 'MAX_OPERATOR_LEGS', 3)
     monkeypatch.setattr(worker, 'calibrate_parts', lambda *_, **__: every[-1:])
 
     def computed():

@@ -226,7 +226,7 @@ def test_a_bag_contains_the_positions_of_the_leg(kind, tmp_path):
     for name in ('stamp_ns', 'latitude', 'longitude', 'height', 'covariance_n',
                  'covariance_type'):
         np.testing.assert_array_equal(getattr(fix, name), getattr(leg.fix, name), name)
-    if REFERENCES[kind].planar:
+    if REFERENCES[kind].is_planar:
         assert (made.positions()[:, 2] == 0.0).all()
         assert np.isnan(fix.height).all()
         assert (fix.covariance_n[:, 2, 2] == 0.0).all()
