@@ -19,6 +19,7 @@ Rectangle = tuple[float, float, float, float]      # x and y, least and largest
 CORRECTION_LENGTH = 0.4
 MAX_HEADING_ERROR = 0.2             # rad. Judgement: beyond it the robot turns on the spot
 ALIGNED = 0.02                      # rad. Judgement: heading error at which this turn ends
+TURN_GAIN, TURN_RESERVE = 1.5, 1.5  # 1/s of the error; of the turn rate, to correct. Judgement
 SLOWEST, SLOWEST_TURN = 0.03, 0.1   # m/s, rad/s. Judgement: slower, many wheels stick
 MOVED, MOVED_TURN = 0.01, 0.02      # m, rad. Judgement: at the slowest within a second
 POSE_LOST_S = 0.5                   # judgement: without a pose
@@ -154,7 +155,7 @@ def command(route: Sequence[Piece], progress: Progress, pose: Pose, t: float,
     if abs(heading_error) > HALF_TURN:
         heading_error = math.copysign(heading_error, -piece.side)
     if progress.turning and abs(heading_error) > ALIGNED:
-        rate = max(min(1.5 * abs(heading_error), config.turn_rate), SLOWEST_TURN)
+        rate = max(min(TURN_GAIN * abs(heading_error), config.turn_rate), SLOWEST_TURN)
         return 0.0, -math.copysign(rate, heading_error), replace(progress, speed=0.0)
     remaining = piece.length - along      # m
     if remaining <= 0:
@@ -164,7 +165,7 @@ def command(route: Sequence[Piece], progress: Progress, pose: Pose, t: float,
         return command(route, progress, pose, t, config)
     if abs(heading_error) > MAX_HEADING_ERROR:
         return 0.0, 0.0, replace(progress, turning=True, speed=0.0)
-    limit = min(config.speed, config.turn_rate / abs(piece.curvature or 1e-9) / 1.5,
+    limit = min(config.speed, config.turn_rate / abs(piece.curvature or 1e-9) / TURN_RESERVE,
                 progress.speed + config.acceleration * step_s)
     if piece.stops:
         limit = min(limit, math.sqrt(2 * config.acceleration * remaining))

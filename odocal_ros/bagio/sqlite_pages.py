@@ -55,7 +55,7 @@ class LeafPages:
             offset = page * self._page_size
             if self._file[offset:offset + 1] == LEAF and (row := next(self._rows_of(page), None)):
                 first_rows[page] = row.number
-        self._pages = sorted(first_rows, key=first_rows.__getitem__)
+        self._pages = sorted(first_rows, key=lambda page: first_rows[page])
 
     def rows(self, topic_ids: Container[int] | None, last_row: int = -1
              ) -> Iterator[tuple[int, int, bytes]]:

@@ -120,25 +120,24 @@ class Health:
         """Return the newest stamp after a block, and note whether time has restarted."""
         # one or two stamps far behind are a driver error, more are a restart of time; if a block
         # ends with few of them, or has one row only, the next block decides
-        stale_before, self._stale_rows = self._stale_rows, 0
+        earlier_stale_rows, self._stale_rows = self._stale_rows, 0
+        stamps = stamps_with_last
         if not steps or min(steps) >= -TIME_RESTART_NS:
-            return stamps_with_last[-1]
-        step_row = steps.index(min(steps))
-        after = max(stamps_with_last[step_row + 1:])
-        has_restarted = after < stamps_with_last[step_row] - TIME_RESTART_NS
-        # a stamp far ahead was a single error: the stamps after it continue those before it
-        continues_before = (
-            steps[step_row - 1] > TIME_RESTART_NS
-            and after >= stamps_with_last[step_row - 1] - TIME_RESTART_NS
-            if step_row else not self.newest_ns)
-        if not has_restarted or continues_before:
-            return stamps_with_last[-1]
-        rows = len(stamps_with_last) - 1 - step_row
-        if rows < TIME_RESTART_ROWS if step_row else rows + stale_before < 2:
-            self._stale_rows = rows
-            return stamps_with_last[step_row]
+            return stamps[-1]
+        k = steps.index(min(steps))      # the largest step back
+        before, after = stamps[k], max(stamps[k + 1:])
+        is_behind = after < before - TIME_RESTART_NS
+        # the stamp before the step was a single error: those after it continue the earlier ones
+        was_ahead = (steps[k - 1] > TIME_RESTART_NS and after >= stamps[k - 1] - TIME_RESTART_NS
+                     if k else not self.newest_ns)
+        if not is_behind or was_ahead:
+            return stamps[-1]
+        stale_rows = len(stamps) - 1 - k
+        if stale_rows < TIME_RESTART_ROWS if k else stale_rows + earlier_stale_rows < 2:
+            self._stale_rows = stale_rows
+            return before
         self.jumped_back = True
-        return stamps_with_last[-1]
+        return stamps[-1]
 
     def silent_s(self, now_ns: int) -> float:
         """Return seconds since the last message, infinite before the first."""

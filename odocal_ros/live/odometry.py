@@ -122,8 +122,8 @@ class OdometryNode(CheckedNode):
             self._run_cycle()
             until = max(next_check_s, min(self._due_ns * 1e-9, next_executor_s))
             if any(source.queue.gate.is_open for source in self._inputs.values()):
-                while (left := until - time.monotonic()) > 0:      # it takes the messages
-                    executor.spin_once(timeout_sec=left)
+                while (remaining_s := until - time.monotonic()) > 0:    # it takes the messages
+                    executor.spin_once(timeout_sec=remaining_s)
                 continue
             if until > next_executor_s:
                 next_executor_s = until + EXECUTOR_PERIOD_S
@@ -227,9 +227,9 @@ def transform_of(pose: Pose, frames: OdomFrames) -> TransformStamped:
     """Return a pose as the transform from the frame odom to the frame base."""
     out = TransformStamped(child_frame_id=frames.base, header=Header(frame_id=frames.odom))
     out.header.stamp.sec, out.header.stamp.nanosec = divmod(pose.stamp_ns, 10**9)
-    move, turn = out.transform.translation, out.transform.rotation
-    move.x, move.y, move.z = pose.position.tolist()
-    turn.x, turn.y, turn.z, turn.w = pose.q.tolist()
+    position, q = out.transform.translation, out.transform.rotation
+    position.x, position.y, position.z = pose.position.tolist()
+    q.x, q.y, q.z, q.w = pose.q.tolist()
     return out
 
 

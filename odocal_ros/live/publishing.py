@@ -60,7 +60,8 @@ SLOT_NAMES = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 
 def calibration_status(view: SessionView) -> DiagnosticStatus:
     """Return the content of ``~/status``; docs/interface.md describes each key."""
     session, results = view.session, view.results
-    hint, ok, known = answers.hint(view), answers.quantities_ok(view), view.observability
+    hint, checks = answers.hint(view), answers.quantities_ok(view)
+    observability = view.observability
     reasons = view.faults if session.state is State.RECORDING else session.reasons
     stage = view.stage if session.state is State.COMPUTING else Stage()
     keys = {
@@ -81,8 +82,8 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'required_scale_sigma_ppm': view.config.verdict.max_scale_sigma * 1e6,
         'required_yaw_sigma_deg': math.degrees(view.config.verdict.max_yaw_sigma),
         'manoeuvres': '; '.join(answers.manoeuvres(view)),
-        'observable': ', '.join(known.observable) if known else '',
-        'not_observable': '; '.join(known.not_observable) if known else '',
+        'observable': ', '.join(observability.observable) if observability else '',
+        'not_observable': '; '.join(observability.not_observable) if observability else '',
         'messages_lost': sum(view.lost_messages.values()),
         'missing': '; '.join(view.missing), 'reasons': ','.join(r.code.name for r in reasons),
         'saved': view.saved, 'save_error': view.save_error, 'lost': view.dropped_leg,
@@ -91,9 +92,9 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'journal': view.journal, 'journal_error': view.journal_error,
         'computing_stage': stage.name, 'computing_passes': stage.passes,
         'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done,
-    } | quantities.status_keys(ok) | status_keys(view.forecast, view.forecast_age_s)
+    } | quantities.status_keys(checks) | status_keys(view.forecast, view.forecast_age_s)
     return DiagnosticStatus(
-        level=level(view), name=STATUS_NAME, message=sentence(view, hint, ok),
+        level=level(view), name=STATUS_NAME, message=sentence(view, hint, checks),
         hardware_id='odocal',
         values=[KeyValue(key=k, value=_value_text(v, PLACES.get(k))) for k, v in keys.items()])
 
@@ -134,8 +135,8 @@ def level(view: SessionView) -> Any:
     return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
 
 
-def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
-    """Return state, accuracy, next action (hint) and problems; ok : which values are in limits."""
+def sentence(view: SessionView, hint: str, checks: dict[str, str]) -> str:
+    """Return state, accuracy, next action (hint) and problems; checks : of limits."""
     session = view.session
     legs = counted(len(session.legs), 'leg')
     if session.carried:
@@ -152,7 +153,7 @@ def sentence(view: SessionView, hint: str, ok: dict[str, str]) -> str:
     }[view.state]
     if view.restored and session.state is State.IDLE:
         state_text += f', including the result restored from {view.restored}'
-    within_limits = '' if session.state is State.RECORDING else quantities.quantities_text(ok)
+    within_limits = '' if session.state is State.RECORDING else quantities.quantities_text(checks)
     errors = [f'{statement}: {error}' for statement, error in (
         ('the result is not saved', view.save_error),
         ('the journal cannot be written', view.journal_error)) if error]

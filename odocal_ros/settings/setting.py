@@ -72,17 +72,17 @@ class Setting:
         if isinstance(value, str):
             self._check_text(value)
         if isinstance(value, (int, float)) and kind is not bool:
-            unset = kind is float and math.isnan(value)
-            if unset and not (isinstance(self.default, float) and math.isnan(self.default)):
+            is_nan = kind is float and math.isnan(value)
+            if is_nan and not (isinstance(self.default, float) and math.isnan(self.default)):
                 raise BadConfig(f'{self.name}: NaN is not allowed')
-            if not unset and not math.isfinite(value):
+            if not is_nan and not math.isfinite(value):
                 raise BadConfig(f'{self.name}: {value} is not finite')
             # larger than any value in SI units; sums with it stay finite
             largest = 1e9
             if kind is float and abs(value) > largest:
                 raise BadConfig(f'{self.name} = {value:g}: the limit is {largest:g}')
-            below = self.low is not None and value < self.low
-            if below or self.high is not None and value > self.high:
+            is_below = self.low is not None and value < self.low
+            if is_below or self.high is not None and value > self.high:
                 unit = '' if self.unit == '1' else self.unit
                 raise BadConfig(f'{self.name} = {value:g}: required: {self.low:g} to '
                                 f'{self.high:g} {unit}'.rstrip())
@@ -98,9 +98,10 @@ class Setting:
                             'digits and _ . / -, without a leading /')
 
 
-def setting(default: object, *about: Any, **more: Any) -> Any:
-    """Declare a setting, with the fields of ``Setting`` after its default."""
-    return field(default=default, metadata={'setting': Setting('', default, *about, **more)})
+def setting(default: object, *values: Any, **named_values: Any) -> Any:
+    """Declare a setting by its default and the further fields of ``Setting``, in their order."""
+    declared = Setting('', default, *values, **named_values)      # ``_settings`` adds the name
+    return field(default=default, metadata={'setting': declared})
 
 
 def _settings(owner: Settings, prefix: str = '') -> Iterator[Setting]:
