@@ -103,19 +103,14 @@ def text_at(body: Bytes, offset: int) -> tuple[str, int]:
 
 
 class Chunk(NamedTuple):
-    """
-    A decompressed chunk: its records ``data[begin:stop]``, and its stated times.
+    """A decompressed chunk: its records ``data[begin:stop]``, and its stated times."""
 
-    ``data`` may contain several chunks that were read at once. ``message_index`` is the index
-    after the chunk in the file, not verified.
-    """
-
-    data: Bytes
+    data: Bytes                  # may contain several chunks that were read at once
     begin: int
     stop: int
     start_ns: int
     end_ns: int
-    message_index: Bytes = b''
+    message_index: Bytes = b''   # the index after the chunk in the file, not verified
 
     @property
     def records(self) -> memoryview:

@@ -57,12 +57,11 @@ class Calibrator(CheckedNode):
     """
     Calibrates an odometer over legs that the operator marks by service.
 
-    Works in any executor; SingleThreadedExecutor is recommended. ``has_running_thread``: when the
-    node was destroyed, one of its threads still ran; it ends with the process.
+    Works in any executor; SingleThreadedExecutor is recommended.
     """
 
     default_name = 'calibrator'
-    has_running_thread = False
+    has_running_thread = False      # after the end of the node; it ends with the process
 
     def _build(self) -> None:
         self.config = params.declare_settings(self)

@@ -54,19 +54,13 @@ STOP_ANSWER_S = 4.0
 
 @dataclass(frozen=True, eq=False)
 class ComputedLeg:
-    """
-    Result of a leg.
+    """Result of a leg."""
 
-    results : one for each part; gaps of the IMU separate parts.   paths : of the longest part.
-    calibration : combination with all other legs.   carried : information of the legs that are no
-    longer kept.   released : number of kept legs, the oldest, that were added to it now.
-    """
-
-    results: tuple[LegResult, ...]
-    paths: Paths
-    calibration: Calibration
-    carried: CarriedInformation | None
-    released: int
+    results: tuple[LegResult, ...]         # of each part; gaps of the IMU separate parts
+    paths: Paths                           # of the longest part
+    calibration: Calibration               # combination with all other legs
+    carried: CarriedInformation | None     # of the legs that are no longer kept
+    released: int                          # number of kept legs, the oldest, added to it now
 
 
 @dataclass(frozen=True, eq=False)

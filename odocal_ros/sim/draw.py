@@ -53,7 +53,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     if 'scale' in fixed_options:     # keep the drawn relative error of the nominal scale
         ratio = options['nominal_scale'] / options['scale']
         fixed_options = {'nominal_scale': fixed_options['scale'] * ratio} | fixed_options
-    options |= fixed_options
+    options |= fixed_options      # seen by the effects; again below, they may change options
     if effects is None:
         odometer_effect = ('', 'coarse_pulses', 'coarse_speed')[int(make_rng(
             seed, 'vehicle odometer').choice(3, p=vehicle.grade_value('odometers')))]

@@ -43,10 +43,12 @@ REFERENCES = {
     'pose': Reference('/pose', 'pose'),
     'mocap': Reference('/mocap/pose', 'pose', options={'fix_sigma': 0.001, 'fix_rate': 50.0}),
     'total_station': Reference('/prism', 'point', options={'fix_sigma': 0.002, 'fix_rate': 10.0}),
-    'slam': Reference('/slam/pose', 'pose_with_covariance', True, True, {
-        'fix_sigma': 0.02, 'fix_rate': 10.0, 'reference_drift': 0.01, 'closure_time': 30.0}),
-    'amcl': Reference('/amcl_pose', 'pose_with_covariance', True, True, {
-        'fix_sigma': 0.01, 'fix_rate': 5.0, 'reference_drift': 0.05, 'drift_length': 2.0}),
+    'slam': Reference('/slam/pose', 'pose_with_covariance', is_planar=True, has_covariance=True,
+                      options={'fix_sigma': 0.02, 'fix_rate': 10.0, 'reference_drift': 0.01,
+                               'closure_time': 30.0}),
+    'amcl': Reference('/amcl_pose', 'pose_with_covariance', is_planar=True, has_covariance=True,
+                      options={'fix_sigma': 0.01, 'fix_rate': 5.0, 'reference_drift': 0.05,
+                               'drift_length': 2.0}),
 }
 
 
