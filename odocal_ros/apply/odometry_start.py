@@ -55,7 +55,8 @@ def find_start(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyCo
     if end >= len(imu.rows) or wheels.end_time() < imu.rows[end].t:
         return None
     rows = imu.rows[row:end + 1]
-    t, w, f = map(np.array, zip(*((one.t, one.w_b, one.f_b) for one in rows), strict=True))
+    t, w, f = map(np.array, zip(*((imu_row.t, imu_row.w_b, imu_row.f_b) for imu_row in rows),
+                                strict=True))
     gaps = np.flatnonzero(np.diff(t) > max(START_GAP, IMU_GAP_INTERVALS * imu.median_interval))
     if len(gaps):
         imu.drop(row + int(gaps[-1]) + 1)      # start from the rows after the gap

@@ -31,8 +31,8 @@ FROZEN_TIME = 0.1         # s; judgement: rows that are equal for longer are fro
 TURN_CHANGE = 10.0        # rad/s^2; physical: of a vehicle, except over a stone
 IMPLAUSIBLE_TIME = 1.0    # s; judgement: a longer turn after a step is real
 ISOLATED_CHANGE = 2.5     # rad/s^2; judgement: least isolated step; turns start more slowly
-SINGLE_LIMITS = (glitches.SINGLE_TURN,) * 3 + (glitches.SINGLE_FORCE,) * 3
-SINGLE_ROWS = glitches.NEIGHBOUR_ROWS + 4      # definition: rows that ``is_single`` uses
+OUTLIER_LIMITS = (glitches.SINGLE_TURN,) * 3 + (glitches.SINGLE_FORCE,) * 3
+OUTLIER_ROWS = glitches.NEIGHBOUR_ROWS + 4      # definition: rows that ``is_outlier`` uses
 
 
 class Row(NamedTuple):
@@ -51,7 +51,7 @@ class Row(NamedTuple):
 
 
 time_of = itemgetter(0)      # definition: sort key of a row
-Pair = tuple[float, float]
+Step = tuple[float, float]      # largest change of gyro and of force, in units of their limits
 
 
 def is_possible(w_b: Vector, f_b: Vector) -> bool:
@@ -74,7 +74,7 @@ class SpikeScreen:
     """
 
     def __init__(self) -> None:
-        self._mean_steps = 0.0, 0.0         # mean steps from row to row, in units of ``_step``
+        self._mean_steps = 0.0, 0.0         # mean ``Step`` from row to row
         self._equal_since = 0.0             # s, begin of equal rows
         self._kept: deque[Row] = deque(maxlen=glitches.NEIGHBOUR_ROWS + 1)
         self._dropped = False               # a row was dropped since the last kept one
@@ -88,7 +88,7 @@ class SpikeScreen:
         while k < len(rows):
             row, last = rows[k], self._kept[-1] if self._kept else rows[k]
             step, isolated = _step(last, row), self._isolated_axes(rows[k:k + 2])
-            spike_rows = None      # after this one, until the values are back
+            spike_rows = None      # number of rows after this one until the values are back
             if any(self._exceeds_usual(step)) and not self._step_is_over(row):
                 within = bisect_right(rows, last.t + glitches.GLITCH_TIME, key=time_of)
                 spike_rows = self._rows_until_return(last, rows[k + 1:within], step)
@@ -141,13 +141,13 @@ class SpikeScreen:
                 self._implausible_until = row.t + IMPLAUSIBLE_TIME
         return self._step_size
 
-    def _exceeds_usual(self, step: Pair) -> tuple[bool, bool]:
+    def _exceeds_usual(self, step: Step) -> tuple[bool, bool]:
         """Return True for gyro and force if the step is implausible for a vehicle."""
         (turn, force), (usual_turn, usual_force) = step, self._mean_steps
         return (turn > max(1.0, glitches.USUAL_STEPS * usual_turn),
                 force > max(1.0, glitches.USUAL_STEPS * usual_force))
 
-    def _update_usual_step(self, step: Pair) -> None:
+    def _update_usual_step(self, step: Step) -> None:
         """Update the mean step; a single spike has little effect."""
         (turn, force), (usual_turn, usual_force) = step, self._mean_steps
         self._mean_steps = (
@@ -156,7 +156,7 @@ class SpikeScreen:
             usual_force + (min(force, 4 * usual_force + 1 / glitches.USUAL_STEPS) - usual_force)
             / USUAL_ROWS)
 
-    def _rows_until_return(self, last: Row, rows: Sequence[Row], step: Pair) -> int | None:
+    def _rows_until_return(self, last: Row, rows: Sequence[Row], step: Step) -> int | None:
         """Return the number of rows until the values are back after a step, None if never."""
         exceeds = self._exceeds_usual(step)
         for k, row in enumerate(rows):
@@ -172,19 +172,19 @@ def _largest(a: Vector, b: Vector) -> float:
     return max(abs(u - x), abs(v - y), abs(w - z))
 
 
-def _step(last: Row, row: Row) -> Pair:
+def _step(last: Row, row: Row) -> Step:
     """Return the steps of gyro and force over TURN_STEP and FORCE_STEP; 0 for NO_FORCE."""
     force = _largest(last.f_b, row.f_b) / glitches.FORCE_STEP
     return _largest(last.w_b, row.w_b) / glitches.TURN_STEP, force if force == force else 0.0
 
 
-def is_single(rows: Sequence[Row]) -> bool:
+def is_outlier(rows: Sequence[Row]) -> bool:
     """
-    Return True if the row before the last of SINGLE_ROWS is an isolated outlier.
+    Return True if the row before the last of OUTLIER_ROWS is an isolated outlier.
 
     As ``screening.glitches.isolated_outliers``, but only earlier rows give the usual deviation.
     """
-    if len(rows) < SINGLE_ROWS:
+    if len(rows) < OUTLIER_ROWS:
         return False
     before, row, after = rows[-3:]
     min_share = 1 - glitches.EQUAL_NEIGHBOURS / 2    # of the deviation: step to an outlier
@@ -192,7 +192,7 @@ def is_single(rows: Sequence[Row]) -> bool:
             or _largest(before.f_b, row.f_b) > min_share * glitches.SINGLE_FORCE):
         return False
     values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
-    for k, (a, b, c, least) in enumerate(zip(*values, SINGLE_LIMITS, strict=True)):
+    for k, (a, b, c, least) in enumerate(zip(*values, OUTLIER_LIMITS, strict=True)):
         deviation = abs(b - (a + c) / 2)
         if deviation > least and abs(c - a) < glitches.EQUAL_NEIGHBOURS * deviation:
             x = [(*one.w_b, *one.f_b)[k] for one in rows[:-2]]
@@ -241,7 +241,7 @@ class ImuStream:
                            'jump and return, or repeat one value')
         for row in kept:
             self.rows.append(row)
-            if len(self.rows) - 2 > self.path_row and is_single(self.rows[-SINGLE_ROWS:]):
+            if len(self.rows) - 2 > self.path_row and is_outlier(self.rows[-OUTLIER_ROWS:]):
                 self._note_dropped(1, 'are isolated outliers')
                 del self.rows[-2]
         self._new_rows += len(kept)

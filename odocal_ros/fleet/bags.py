@@ -146,8 +146,8 @@ def _bags_in(name: str) -> list[str]:
     """Return the bags at a path: itself, the matches of a glob, or all in a folder."""
     fs, path = file_system(name)
     try:
-        paths = fs.glob(path) if any(c in path for c in '*?[') else [path]
-        bags = [bag for found in sorted(paths) for bag in _bags_in_folder(fs, found)]
+        paths = fs.glob(path) if any(character in path for character in '*?[') else [path]
+        bags = [bag for one_path in sorted(paths) for bag in _bags_in_folder(fs, one_path)]
         return [str(fs.unstrip_protocol(bag)) for bag in bags] if '://' in name else bags
     except OSError as error:
         raise BadUsage(f'{name}: cannot be read ({error_text(error)})') from None

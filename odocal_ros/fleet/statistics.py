@@ -74,12 +74,12 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
 
     An outlier at the last leg is a change, since no later leg contradicts it.
     """
-    n = len(y)
+    n, steps = len(y), len(y) - 1
     if n < 2:
         return History()
     has_slope = t is not None and np.ptp(t) > 0 and n > 2
-    # whitened columns: y, the constant, and the candidates W: n - 1 steps, from leg 1, 2, ... on;
-    # n - 2 outliers, legs 1 to n - 2 alone; and the slope
+    # whitened columns: y, the constant, and the candidates W: a step at each leg but the first;
+    # each leg but the first and the last as an outlier; and the slope
     white = np.linalg.solve(np.linalg.cholesky(V), np.column_stack([
         y, np.tril(np.ones((n, n))), np.eye(n)[:, 1:n - 1],
         *([t - t[0]] if t is not None and has_slope else [])]))
@@ -93,13 +93,17 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
         if np.linalg.matrix_rank(X) == X.shape[1]:
             size, sigma = _fit(z, X)
             estimate[slope] = float(size[-1]), float(sigma[-1])
-    return History(tuple(Change(k + 1, *estimate[k]) for k in selected if k < n - 1),
-                   tuple(k - n + 2 for k in selected if k >= n - 1 and k != slope),
+    return History(tuple(Change(k + 1, *estimate[k]) for k in selected if k < steps),
+                   tuple(k - steps + 1 for k in selected if steps <= k != slope),
                    *estimate.get(slope, (None, None)))
 
 
 def _select(z: Floats, level: Floats, W: Floats, limit: float) -> list[int]:
-    """Return the columns of W that explain z with significance, in addition to the level."""
+    """
+    Return the columns of the candidates W that explain z with significance.
+
+    z : (n,), level : (n, 1) constant, W : (n, c), whitened.   limit : sigmas.
+    """
     selected: list[int] = []
     while len(selected) < (len(z) - 1) // 2 or not selected:
         # z and W minus their projections on level and selected changes
@@ -144,30 +148,31 @@ def population(values: Floats, sigmas: Floats) -> Population:
     The spread makes the median deviation that of a normal distribution; the mean is Huber's. Both
     are robust to outliers.
     """
-    x, s = np.asarray(values, float), np.asarray(sigmas, float)
-    mean, spread = float(np.median(x)), 0.0
-    if len(x) < MIN_VEHICLES:
-        return Population(mean, float(s.max()), 0.0, np.full(len(x), np.nan))
+    values, sigmas = np.asarray(values, float), np.asarray(sigmas, float)
+    mean, spread = float(np.median(values)), 0.0
+    if len(values) < MIN_VEHICLES:
+        return Population(mean, float(sigmas.max()), 0.0, np.full(len(values), np.nan))
     huber = 1.5    # sigmas from which a vehicle has less weight
     max_passes = 50
     for _ in range(max_passes):
         previous = mean
-        spread = _spread(np.abs(x - mean), s)
-        total = np.hypot(s, max(spread, 1e-300))
-        weight = np.minimum(1.0, huber * total / np.maximum(np.abs(x - mean), 1e-300)) / total**2
-        mean = float(weight @ x / weight.sum())
+        deviation = np.abs(values - mean)
+        spread = _spread(deviation, sigmas)
+        total = np.hypot(sigmas, max(spread, 1e-300))
+        weight = np.minimum(1.0, huber * total / np.maximum(deviation, 1e-300)) / total**2
+        mean = float(weight @ values / weight.sum())
         if abs(mean - previous) <= 1e-12 * max(float(total.min()), 1e-300):
             break
-    return Population(mean, float(weight.sum()**-0.5), spread, (x - mean) / total)
+    return Population(mean, float(weight.sum()**-0.5), spread, (values - mean) / total)
 
 
-def _spread(deviation: Floats, s: Floats) -> float:
+def _spread(deviation: Floats, sigmas: Floats) -> float:
     """Return the spread at which the median of deviations over sigma is that of a normal one."""
-    if np.median(deviation / np.maximum(s, 1e-300)) <= NORMAL_MEDIAN:
+    if np.median(deviation / np.maximum(sigmas, 1e-300)) <= NORMAL_MEDIAN:
         return 0.0
     low, high = 0.0, float(deviation.max()) / NORMAL_MEDIAN
     for _ in range(60):
         middle = (low + high) / 2
-        too_small = np.median(deviation / np.hypot(s, middle)) > NORMAL_MEDIAN
+        too_small = np.median(deviation / np.hypot(sigmas, middle)) > NORMAL_MEDIAN
         low, high = (middle, high) if too_small else (low, middle)
     return high

@@ -68,7 +68,7 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
 
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
     """
-    unusable = missing_force_cause(leg.imu, config.imu.accel_scale)
+    missing_force = missing_force_cause(leg.imu, config.imu.accel_scale)
     running = smoother_forecast.update_running(leg, config, smoother, is_needed)
     only_smoother = deciding_methods(config.method) == smoother_forecast.ONLY_SMOOTHER
     if only_smoother or smoother_forecast.has_all_values(running):     # two_point gives no value
@@ -78,9 +78,9 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
         forecast = _forecast_by_end_points(leg, fix_rate, config, is_needed)
         if smoother is not None and 'smoother' in deciding_methods(config.method):
             forecast = replace(forecast, scale=_without_refusal(forecast.scale))
-            if not unusable:
+            if not missing_force:
                 forecast = replace(forecast, yaw=_without_refusal(forecast.yaw))
-    if unusable:
+    if missing_force:
         forecast = smoother_forecast.without_accelerometer_values(forecast)
     if not is_needed():
         raise Abandoned

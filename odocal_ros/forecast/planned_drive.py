@@ -99,7 +99,8 @@ class PlannedDrive:
     def cut_at(self, t_stop: float, rest: float) -> 'PlannedDrive':
         """Return the drive up to a time and a stop of ``rest`` s there."""
         keep = self.t <= t_stop
-        cut = replace(self, **{n: getattr(self, n)[keep] for n in ('t', 'speed', 'yaw', 'slope')})
+        cut = replace(self, **{name: getattr(self, name)[keep]
+                               for name in ('t', 'speed', 'yaw', 'slope')})
         return cut._hold_row(len(cut.t) - 1, rest, at_rest=True)
 
     def _hold_row(self, k: int, seconds: float, at_rest: bool = False) -> 'PlannedDrive':

@@ -145,10 +145,10 @@ def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
     return {'heading': Heading(t, yaw, np.full(len(t), noise), sigma, source)}
 
 
-def _true_state(motion: _Motion, key: Ints) -> State:
-    """Return the state at the keyframes, rows ``key``, with all errors and biases zero."""
-    N = len(key)
-    return State(motion.t[key], motion.p_n[key], motion.v_n[key], motion.C_nb[key],
+def _true_state(motion: _Motion, rows: Ints) -> State:
+    """Return the state at the keyframes, rows of the motion, with all errors and biases zero."""
+    N = len(rows)
+    return State(motion.t[rows], motion.p_n[rows], motion.v_n[rows], motion.C_nb[rows],
                  np.zeros((N, 3)), np.zeros((N, 3)), np.zeros(N), np.zeros((N, 3)),
                  np.zeros(M)).with_mean_up()
 
@@ -161,9 +161,9 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     The scale is 1, angles are 0; sigmas, budget and reasons are computed as after a fit.
     spacing : s between keyframes; default: ``keyframe_spacing``.
     """
-    few = too_few_samples_reason(int(drive.duration * sigmas.fix_rate), drive.duration)
-    if few:
-        return refused_result([few], '1')
+    too_few = too_few_samples_reason(int(drive.duration * sigmas.fix_rate), drive.duration)
+    if too_few:
+        return refused_result([too_few], '1')
     ideal = ideal_samples(drive, sigmas, keyframe_spacing(drive) if spacing is None else spacing)
     problem = make_problem(ideal.leg, sigmas.config, ideal.imu)
     levels = planned_noise_levels(problem, sigmas, ideal.fixes_in_one)

@@ -53,12 +53,12 @@ class Calibration:
     @property
     def values(self) -> dict[str, float | None]:
         """Return each value by name, SI and radians; None: not determined."""
-        return {name: e.value for name, e in self._estimates().items()}
+        return {name: estimate.value for name, estimate in self._estimates().items()}
 
     @property
     def sigmas(self) -> dict[str, float | None]:
         """Return one standard deviation of each value."""
-        return {name: e.sigma for name, e in self._estimates().items()}
+        return {name: estimate.sigma for name, estimate in self._estimates().items()}
 
     def _estimates(self) -> dict[str, Estimate]:
         """Return the estimates by name; scale, yaw and pitch exist even if no leg was fitted."""
@@ -79,7 +79,7 @@ class Calibration:
     def to_frame(self) -> Any:
         """Return a pandas.DataFrame, a row for each value: value, sigma, unit, method."""
         estimates = self._estimates()
-        columns = {name: [getattr(e, name) for e in estimates.values()]
+        columns = {name: [getattr(estimate, name) for estimate in estimates.values()]
                    for name in ('value', 'sigma', 'unit', 'method')}
         return frame_of(columns).set_axis(list(estimates))
 

@@ -217,8 +217,7 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
                       sentences, changed)
 
 
-def _summary(changes: list[Change],
-             stored: list[Stored]) -> tuple[tuple[str, ...], bool | None]:
+def _summary(changes: list[Change], stored: list[Stored]) -> tuple[tuple[str, ...], bool | None]:
     """Return summary sentences, and whether any change is significant; None: not comparable."""
     if not changes:
         return ('nothing to compare: no value exists in two calibrations that are not '

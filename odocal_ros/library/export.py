@@ -122,8 +122,7 @@ def write_mcap(result: Calibration, path: Path) -> None:
 
 def _topics(result: Calibration) -> list[encode.Topic]:
     """Return the topics of ``write_mcap``."""
-    pose, state = (_by_time(series_of(result))
-                   for series_of in (series.trajectory, series.states))
+    pose, state = (_by_time(series_of(result)) for series_of in (series.trajectory, series.states))
     t, n = pose['stamp_ns'], len(pose['stamp_ns'])
     zeros = np.zeros(n, np.int64)
     (gyro, gyro_sigma), (force, force_sigma) = (

@@ -171,16 +171,17 @@ class Planned(Plan):
                        'heading_sigma': alignment.heading_sigma, 'fix_sigma': sigmas.fix,
                        'fix_rate': sigmas.fix_rate, 'correlation_time': sigmas.correlation_time,
                        'pulse': sigmas.quantum, 'sway': sigmas.sway, 'slip_walk': sigmas.slip},
-            'verdict': self.verdict.value, 'reasons': [r.as_dict() for r in self.reasons],
+            'verdict': self.verdict.value,
+            'reasons': [reason.as_dict() for reason in self.reasons],
             'estimates': {name: {'sigma': self.sigma(name), 'method': self.method_of(name) or None}
                           for name in PARAMETERS},
             'methods': {name: {
                 'estimates': {name: {'sigma': e.sigma, 'unit': e.unit}
                               for name, e in method.estimates.items() if name != 'scale_ratio'},
-                'reasons': [r.as_dict() for r in self.reasons_of(name)],
+                'reasons': [reason.as_dict() for reason in self.reasons_of(name)],
                 'budget': method.details.get('budget', {})}
                 for name, method in self.methods.items()},
-            'changes': [{'text': c.text, **c.sigmas} for c in self.improvements]}
+            'changes': [{'text': change.text, **change.sigmas} for change in self.improvements]}
 
 
 def plan(*, distance: float | None = None, speed: float | None = None,

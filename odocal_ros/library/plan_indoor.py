@@ -56,8 +56,8 @@ class PlannedRun:
         return {'run': self.name, 'duration': float(self.motion.t[-1]),
                 'distance': self.motion.distance, 'method': self.method.name,
                 'sigmas': {name: self.sigma(name) for name in (
-                    *(n for n in SHOWN if n in self.method.estimates), 'ratio')},
-                'reasons': [r.as_dict() for r in self.method.reasons]}
+                    *(shown for shown in SHOWN if shown in self.method.estimates), 'ratio')},
+                'reasons': [reason.as_dict() for reason in self.method.reasons]}
 
 
 def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'differential',
@@ -126,7 +126,7 @@ def ratio_sigma(method: MethodResult) -> float | None:
         return float(method.details['ratio_sigma'])
     left, right = (method.estimates.get(f'scale_factor_{side}') for side in SIDES)
     rho = method.details['correlation'].get('scale_factor_left,scale_factor_right')
-    a, b = (one.relative_sigma if one else None for one in (left, right))
+    a, b = (wheel.relative_sigma if wheel else None for wheel in (left, right))
     if a is None or b is None or rho is None:
         return None
     return float(np.sqrt(a**2 + b**2 - 2 * rho * a * b))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Planned drives from figures, a named scenario, a GPX track or a recorded bag."""
+"""Planned drives from figures, a named scenario, a GPX track or a read_topics bag."""
 
 from datetime import datetime, UTC
 import math
@@ -112,7 +112,8 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise BadUsage(f'{path}: is not a GPX file ({error}); export the track again as '
                        'GPX') from None
-    points = [e for e in root.iter() if e.tag.rpartition('}')[2] in ('trkpt', 'rtept')]
+    points = [element for element in root.iter()
+              if element.tag.rpartition('}')[2] in ('trkpt', 'rtept')]
     max_points = 1_000_000
     if not 2 <= len(points) <= max_points:
         raise BadUsage(f'{path}: holds {len(points)} track points; required: 2 to '
@@ -137,7 +138,7 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
 
 def _child(point: Any, name: str) -> str | None:
     """Return the text of the first child of an element with a name, None without one."""
-    return next((c.text for c in point if c.tag.rpartition('}')[2] == name), None)
+    return next((child.text for child in point if child.tag.rpartition('}')[2] == name), None)
 
 
 def _seconds(text: str | None) -> float | None:
@@ -208,11 +209,11 @@ def from_bag(path: Path, config: Config, topics: dict[str, str],
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.forecast.leg_so_far import drive_profile, fix_and_count_accuracy
     from odocal_ros.library.find_legs import find_legs, marked_legs
-    from odocal_ros.library.read_bag import readers_of, recorded
+    from odocal_ros.library.read_bag import read_topics, readers_of
     from odocal_ros.screening.screen import screen
     with open_bag(path) as bag:
-        chosen, readers = readers_of(bag, topics, config, journal)
-        recorder = recorded(bag, chosen, readers)
+        mapping, readers = readers_of(bag, topics, config, journal)
+        recorder = read_topics(bag, mapping, readers)
         start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
     inputs, _ = screen(recorder.close(start_ns, stop_ns, config.leg.preroll), config)
     return drive_profile(inputs, config), fix_and_count_accuracy(inputs, config)

@@ -115,12 +115,12 @@ def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
     """Return slot -> topic, and topic -> reader; ``topics`` take precedence over a journal's."""
     from odocal_ros.library.topics import choose_topics, local_reference
     requested = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
-    chosen = choose_topics(bag.topics, config, requested, bool(floor_marks_of(config, bag)))
-    note = local_reference(bag.topics, chosen, requested)
+    mapping = choose_topics(bag.topics, config, requested, bool(floor_marks_of(config, bag)))
+    note = local_reference(bag.topics, mapping, requested)
     if note and listener:
         listener.note(note)
-    return chosen, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
-                    for slot, topic in chosen.items()}
+    return mapping, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
+                    for slot, topic in mapping.items()}
 
 
 def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
@@ -150,10 +150,10 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
         if journal:
             listener.note(f'{bag.name} is a journal: settings and topics come from '
                           f'{journal.path}; options take precedence')
-        chosen, readers = readers_of(bag, topics or {}, settings, journal, listener)
+        mapping, readers = readers_of(bag, topics or {}, settings, journal, listener)
         digest = executor.submit(bag_sha256, bag)
         with listener.phase(f'reading {name}') as progress:
-            recorder = recorded(bag, chosen, readers, progress)
+            recorder = read_topics(bag, mapping, readers, progress)
         if settings.reference.marks:        # those of a node were tested when they were set
             check_wheels_stand(floor_marks, recorder, bag.start_ns)
         if floor_marks:
@@ -164,22 +164,22 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
                 listener.note(note)
         with listener.phase(f'checksum of {name}'):
             sha256 = digest.result()
-        imu = chosen.get('imu', '')
+        imu = mapping.get('imu', '')
         frame = readers[imu].frame or bag.frame(imu) if imu else ''
         return Recording(
-            name, sha256, chosen, frame, bag.start_ns, bag.end_ns,
+            name, sha256, mapping, frame, bag.start_ns, bag.end_ns,
             tuple(marks), bool(journal and not marks and has_dropped_legs(bag)),
             tuple(note for note in bag.notes if not isinstance(note, str)), settings, recorder)
 
 
-def recorded(bag: Bag, chosen: dict[str, str], readers: dict[str, Reader],
-             progress: arguments.Progress | None = None) -> LegRecorder:
-    """Return the rows of the chosen topics, slot -> topic, by their readers."""
+def read_topics(bag: Bag, mapping: dict[str, str], readers: dict[str, Reader],
+                progress: arguments.Progress | None = None) -> LegRecorder:
+    """Return the rows of topics by their readers; mapping: slot -> topic."""
     recorder = LegRecorder()
     bag.read(add_static_readers(readers, bag.topics), recorder.feed, progress)
-    recorder.form = readers[chosen['odometer']].form or recorder.form
-    if 'odometer_right' in chosen:
-        recorder.form_right = readers[chosen['odometer_right']].form
+    recorder.form = readers[mapping['odometer']].form or recorder.form
+    if 'odometer_right' in mapping:
+        recorder.form_right = readers[mapping['odometer_right']].form
     return recorder
 
 

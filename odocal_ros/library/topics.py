@@ -61,25 +61,25 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     fit. All such inputs are named at once, with the option that selects each. BadTopics lists
     topics.
     """
-    chosen = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
-    _check_reference(chosen)
-    if marked and 'fix' in chosen:
-        raise BadUsage(f'--fix-topic {chosen["fix"]}: marks (reference.marks) replace fixes; omit '
-                       'one of them')
+    mapping = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
+    _check_reference(mapping)
+    if marked and 'fix' in mapping:
+        raise BadUsage(f'--fix-topic {mapping["fix"]}: marks (reference.marks) replace fixes; '
+                       'omit one of them')
     errors: list[str] = []
     for slot in required_slots(config, marked):
-        if slot in chosen:
+        if slot in mapping:
             continue
-        fitting = candidates(topics, slot, config, chosen)
+        fitting = candidates(topics, slot, config, mapping)
         if len(fitting) == 1:
-            chosen[slot] = fitting[0]
+            mapping[slot] = fitting[0]
         elif not _is_optional(slot, config, fitting):
-            errors.append(_unfilled_slot_text(topics, slot, fitting, config, chosen))
+            errors.append(_unfilled_slot_text(topics, slot, fitting, config, mapping))
     if errors:
         if not all('; choose one with ' in text for text in errors):
             errors.append(f'the bag has:{_described(topics, topics)}')
         raise BadTopics(';\n'.join(errors))
-    return chosen
+    return mapping
 
 
 def required_slots(config: Config, marked: bool = False) -> tuple[str, ...]:
@@ -91,10 +91,10 @@ def required_slots(config: Config, marked: bool = False) -> tuple[str, ...]:
             *(slot for slot in slots if slot not in CHOSEN_FIRST))
 
 
-def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]) -> list[str]:
+def candidates(topics: Topics, slot: str, config: Config, mapping: dict[str, str]) -> list[str]:
     """Return the topics that fit a slot and are not chosen for another."""
     types = _types(slot, config)
-    taken = set(chosen.values())
+    taken = set(mapping.values())
     fitting = [t.name for t in topics.values()
              if t.count and t.msgtype in types and t.name not in taken
              and t.name not in SYSTEM_TOPICS and '/calibrator/' not in t.name]
@@ -107,7 +107,7 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
         if config.alignment.heading_source == 'auto':    # by the name of the node's input
             return [name for name in fitting if _base_name(name) == 'heading']
         # a single topic with an orientation is the IMU
-        is_imu = len(fitting) == 1 and 'imu' not in chosen
+        is_imu = len(fitting) == 1 and 'imu' not in mapping
         fitting = [name for name in fitting if 'heading' in name] or ([] if is_imu else fitting)
     elif slot == 'imu':
         fitting = _preferably_without(fitting, ('heading',))
@@ -128,18 +128,18 @@ def without_estimates(names: list[str]) -> list[str]:
     return [name for name in names if not ESTIMATES.search(name.lower())] or names
 
 
-def _check_reference(chosen: dict[str, str]) -> None:
+def _check_reference(mapping: dict[str, str]) -> None:
     """Raise BadUsage if one topic is both odometer and reference: its scale would be 1."""
     for slot in ('odometer', 'odometer_right'):
-        if 'fix' in chosen and chosen.get(slot) == chosen['fix']:
-            raise BadUsage(f'{chosen["fix"]} is both {topic_option(slot)} and '
+        if 'fix' in mapping and mapping.get(slot) == mapping['fix']:
+            raise BadUsage(f'{mapping["fix"]} is both {topic_option(slot)} and '
                            f'{topic_option("fix")}: an odometer cannot be calibrated against '
                            'itself; name another topic for one of them')
 
 
-def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str, str]) -> str:
+def local_reference(topics: Topics, mapping: dict[str, str], overrides: dict[str, str]) -> str:
     """Return the note that poses are the reference if the user did not name them, or ''."""
-    fix = chosen.get('fix', '')
+    fix = mapping.get('fix', '')
     if not fix or 'fix' in overrides or topics[fix].msgtype in GEODETIC:
         return ''
     return (f'no NavSatFix with messages in the bag; position reference: {fix} '
@@ -200,9 +200,9 @@ def _fits_slot(msgtype: str, slot: str) -> bool:
 
 
 def _unfilled_slot_text(topics: Topics, slot: str, fitting: list[str], config: Config,
-                        chosen: dict[str, str]) -> str:
+                        mapping: dict[str, str]) -> str:
     """Return the reason for a slot without topic, and the option that selects one."""
-    fix = chosen.get('fix', '')
+    fix = mapping.get('fix', '')
     if slot == 'odometer' and fix and not fitting and topics[fix].msgtype in ODOMETERS:
         return (f'no odometer in the bag besides {fix}, which is the position reference '
                 f'({topic_option("fix")}): an odometer cannot be calibrated against itself')
@@ -221,7 +221,7 @@ def _unfilled_slot_text(topics: Topics, slot: str, fitting: list[str], config: C
         return (f'no {INPUTS[slot].label} (a topic of {", ".join(types[:-1])} or {types[-1]}) in '
                 f'the bag; name a {TRANSFORMS} or nav_msgs/msg/Odometry with {topic_option(slot)}')
     allowed = ' or '.join(types) if len(types) < 3 else 'counts, angles or speeds'
-    used = [topic for topic in chosen.values() if topics[topic].msgtype in types]
+    used = [topic for topic in mapping.values() if topics[topic].msgtype in types]
     except_for = ' besides the IMU' if slot == 'heading' else (
         f' besides {", ".join(used)}' if used else '')
     return f'no {INPUTS[slot].label} (a topic of {allowed}{except_for}) in the bag'

@@ -71,13 +71,13 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse unknown arguments here: the parser of the command names its own help."""
-        found, unknown = super().parse_known_args(args, namespace)
+        parsed, unknown = super().parse_known_args(args, namespace)
         if unknown:
             options = [word for word in unknown if word.startswith('-')] or unknown
             similar = get_close_matches(options[0], self._option_string_actions, 1, 0.75)
             self.error(f'unrecognized arguments: {" ".join(options)}'
                        + ''.join(f'; did you mean {name}?' for name in similar))
-        return found, unknown
+        return parsed, unknown
 
 
 class _Usage(OdocalError):

@@ -84,12 +84,12 @@ class FieldCollector:
 
     def _find_fields(self, message: object) -> None:
         """Find the numeric fields of the first message; raise BadData if there are none."""
-        found = list(islice(_numbers(message, ''), MAX_FIELDS))
-        if not found:
+        numbers = list(islice(_numbers(message, ''), MAX_FIELDS))
+        if not numbers:
             raise BadData('no numeric field')
-        self.paths = [path for path, _ in found]
-        self.is_integer = [isinstance(value, Integral) for _, value in found]
-        self._stride = max(1, -(-self.count // min(MAX_MESSAGES, MAX_VALUES // len(found))))
+        self.paths = [path for path, _ in numbers]
+        self.is_integer = [isinstance(value, Integral) for _, value in numbers]
+        self._stride = max(1, -(-self.count // min(MAX_MESSAGES, MAX_VALUES // len(numbers))))
 
     def facts(self, path: FixPath) -> dict[str, Any]:
         """Return the number of fields and those that follow the path of the fixes."""
@@ -105,16 +105,16 @@ class FieldCollector:
             field | {'settings': _settings(field, f'odometer.field={field["path"]}')}
             for field in sorted((field for field, _ in matching), key=rank)]}
 
-    def settings(self, found: Sequence[dict[str, Any]],
+    def settings(self, fields: Sequence[dict[str, Any]],
                  turn_rate: tuple[Ints, Floats] | None) -> list[str]:
         """
         Return the settings for left and right wheels, or for the best field.
 
-        found : of ``facts``.   turn_rate : times, ns, and rate to the left, rad/s, if known.
+        fields : of ``facts``.   turn_rate : times, ns, and rate to the left, rad/s, if known.
         """
-        best, t_ns = found[0], self._t_ns
+        best, t_ns = fields[0], self._t_ns
         scale_tolerance = 0.3  # judgement: scales of the wheels of a vehicle differ less, relative
-        wheels = [field for field in found if all(
+        wheels = [field for field in fields if all(
             field[key] == best[key] for key in ('quantity', 'wrap', 'is_integer'))
             and abs(field['scale'] / best['scale'] - 1) < scale_tolerance]
         if turn_rate is not None and 1 < len(wheels) <= len(WHEELS):
@@ -205,9 +205,9 @@ def make_collectors(topics: Mapping[str, TopicInfo], known: Collection[str],
     possible = [name for name, info in topics.items()
                 if info.count and name not in known and _may_be_odometer(info)]
     usable = {*requested, *without_estimates(possible)}
-    found = [name for name, info in topics.items()
+    searched = [name for name, info in topics.items()
              if info.count and name not in known and name in usable]
-    return {name: FieldCollector(topics[name].count) for name in found[:MAX_TOPICS]}
+    return {name: FieldCollector(topics[name].count) for name in searched[:MAX_TOPICS]}
 
 
 def _may_be_odometer(info: TopicInfo) -> bool:
@@ -262,6 +262,6 @@ def drop_weak_fields(fields: Sequence[dict[str, Any]]) -> None:
 
 def best_topic(topics: Sequence[dict[str, Any]], requested: str) -> dict[str, Any] | None:
     """Return the topic whose field follows the path best, only ``requested`` if set, or None."""
-    found = [facts for facts in topics if facts.get('fields', {}).get('found') and (
+    matching = [facts for facts in topics if facts.get('fields', {}).get('found') and (
         not requested or facts['name'].strip('/') == requested.strip('/'))]
-    return min(found, default=None, key=lambda facts: rank(facts['fields']['found'][0]))
+    return min(matching, default=None, key=lambda facts: rank(facts['fields']['found'][0]))

@@ -92,7 +92,7 @@ def _indoor(args: argparse.Namespace) -> int:
         reference=args.reference, drive=args.drive, size=args.size, rounds=args.rounds,
         speed=args.speed, track_width=args.track_width, slip=args.slip_walk))
     if args.json:
-        print_json([one.to_dict() for one in runs])
+        print_json([run.to_dict() for run in runs])
     else:
         print_text(indoor_screen(runs))
     return 0

@@ -21,7 +21,8 @@ from odocal_ros.settings.levels import DAY_NS
 if TYPE_CHECKING:
     from odocal_ros.sim.options import SimOptions
 
-NUMBERS = {      # options that are fields of SimOptions: (metavar, help); below, help of angles
+# options that are fields of SimOptions: metavar and help; of angles, in degrees, only the help
+NUMBER_OPTIONS = {
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
     'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),
     'odometer_rate': ('HZ', 'rate of the odometer (default 50)'),
@@ -62,7 +63,7 @@ NUMBERS = {      # options that are fields of SimOptions: (metavar, help); below
     'velocity_outliers': ('SHARE', 'fraction of outliers in it, 0 to 0.5'),
     'height': ('M', 'ellipsoidal height at the start (default 50)'),
 }
-DEGREES = {
+ANGLE_OPTIONS = {
     'yaw': 'yaw mounting angle (default 1)',
     'pitch': 'pitch mounting angle (default 0.4; paper 0)',
     'roll': 'roll mounting angle (default 0)',
@@ -105,9 +106,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='random slip while moving, m per square root of a second')
     add('--outage', type=_span, action='append', metavar='A:B', dest='outages',
         help='no fixes from A to B seconds; repeatable')
-    for name, (what, text) in NUMBERS.items():
-        add(_flag(name), type=float, metavar=what, help=text)
-    for name, text in DEGREES.items():
+    for name, (metavar, text) in NUMBER_OPTIONS.items():
+        add(_flag(name), type=float, metavar=metavar, help=text)
+    for name, text in ANGLE_OPTIONS.items():
         add(_flag(name) + '-deg', type=degrees, metavar='DEG', dest=name, help=text)
     for name in LEVER_ARMS:
         add(_flag(name), type=float, nargs=3, metavar=('X', 'Y', 'Z'),
@@ -118,7 +119,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'has all sensor effects (docs/zoo.md), clean has none')
     add('--effect', action='append', metavar='NAME', dest='effects',
         help='random vehicle with only this effect; repeatable')
-    add('--real', action='append', default=[], metavar='NAME=VALUE', dest='figures',
+    add('--real', action='append', default=[], metavar='NAME=VALUE', dest='sensor_parameters',
         help='one parameter of a real sensor, SI and radians; repeatable')
     add('--known-heading-sigma-deg', type=float, metavar='DEG',
         help='put a heading of this accuracy into calibrator.yaml')
@@ -162,17 +163,17 @@ def options_of(args: argparse.Namespace) -> 'SimOptions':
     seed = options.get('seed', SimOptions.seed)
     days = 3650    # then the days of the seeds repeat
     options['start_ns'] = SimOptions.start_ns + (seed - 1) % days * DAY_NS
-    return _with_figures(args, options)
+    return _with_random_vehicle(args, options)
 
 
-def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOptions':
+def _with_random_vehicle(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOptions':
     """Return SimOptions of the options, a random vehicle if requested, and sensor parameters."""
     from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.options import DEFAULTS, SimOptions
     from odocal_ros.sim.real_effects import parse_parameter, RealEffects
-    figures = dict(parse_parameter(text) for text in args.figures)
+    sensor_parameters = dict(parse_parameter(text) for text in args.sensor_parameters)
     if not (args.vehicle or args.effects):
-        return SimOptions(**options, real=RealEffects(**figures))
+        return SimOptions(**options, real=RealEffects(**sensor_parameters))
     if 'odometer' in options:
         raise BadUsage(f'--odometer {options["odometer"]}: a random vehicle has its own odometer; '
                        'omit this option, or use --effect coarse_speed')
@@ -181,8 +182,8 @@ def _with_figures(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOpti
     effects = () if args.vehicle == 'clean' else args.effects
     seed = options.pop('seed', SimOptions.seed)
     grade = options.pop('imu_grade', DEFAULTS.get(args.scenario, {}).get('imu_grade', 'consumer'))
-    kind = options.pop('scenario')
-    return draw_vehicle(seed, kind, grade, effects, **options, real=figures)[0]
+    scenario = options.pop('scenario')
+    return draw_vehicle(seed, scenario, grade, effects, **options, real=sensor_parameters)[0]
 
 
 def run(args: argparse.Namespace) -> int:

@@ -32,18 +32,18 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
 
     not_following : odometer topics that do not follow the path of the fixes, while another does.
     """
-    chosen = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
-    if not config.odometer.wheel_keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
+    mapping = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
+    if not config.odometer.wheel_keys and not {'odometer', 'odometer_right'} & mapping.keys() and (
             pair := _left_right_pair(topics, [
-                topic for topic in candidates(topics, 'odometer', config, chosen)
+                topic for topic in candidates(topics, 'odometer', config, mapping)
                 if topic not in not_following])):
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
-        chosen['odometer'], chosen['odometer_right'] = pair
+        mapping['odometer'], mapping['odometer_right'] = pair
     for slot in required_slots(config):
-        found = [] if slot in chosen else candidates(topics, slot, config, chosen)
-        if found:
-            chosen[slot] = _sorted_topics(topics, slot, found, not_following)[0]
-    return chosen, config
+        fitting = [] if slot in mapping else candidates(topics, slot, config, mapping)
+        if fitting:
+            mapping[slot] = _sorted_topics(topics, slot, fitting, not_following)[0]
+    return mapping, config
 
 
 def _left_right_pair(topics: dict[str, TopicInfo], unused: list[str]) -> tuple[str, str] | None:
@@ -109,9 +109,10 @@ def replay_command(path: str, topics: dict[str, TopicInfo], config: Config,
         return ''
     words = ['odocal', 'replay', path]
     for slot, topic in mapping.items():
-        found = candidates(topics, slot, config, {s: t for s, t in mapping.items() if s != slot})
+        others = {other: name for other, name in mapping.items() if other != slot}
+        fitting = candidates(topics, slot, config, others)
         local = slot == 'fix' and topics[topic].msgtype not in GEODETIC  # stated, as it is unusual
-        if slot in overrides or len(found) > 1 or topic not in found or local:
+        if slot in overrides or len(fitting) > 1 or topic not in fitting or local:
             words += [topic_option(slot), topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:
         extra = ['odometer.left=topic', 'odometer.right=topic', *extra]

@@ -226,8 +226,7 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     # duration of a cell, s: its mean path length is ten times the fix noise or more, so that the
     # noise of both ends is below 15 % of it
     shortest, noise_ratio = 4.0, 10.0
-    cell = max(shortest, noise_ratio * fix_white_noise(fixes_n) * (t[-1] - t[0])
-               / path_length)
+    cell = max(shortest, noise_ratio * fix_white_noise(fixes_n) * (t[-1] - t[0]) / path_length)
     knots = np.unique(np.searchsorted(t[:-1], np.arange(t[0], t[-1], cell)))
     return FixPath(t_ns[knots], np.hypot(*np.diff(fixes_n[knots], axis=0).T),
                    float(np.sqrt(np.median(covariance_n[use][:, 0, 0]))))

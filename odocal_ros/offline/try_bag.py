@@ -122,14 +122,14 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
     from odocal_ros.offline.suggest import likely_mapping, other_candidates, reason_for_choice
     mapping, not_following = content['mapping'], content['not_following']
     _, config = likely_mapping(bag.topics, config, topics, not_following)
-    found = []
+    choices = []
     for slot in mapping.keys() - topics.keys():
         remaining = other_candidates(bag.topics, slot, config, mapping, not_following)
         if remaining and mapping[slot] in candidates(bag.topics, slot, config, {}):
             reason = reason_for_choice(bag.topics, slot, mapping[slot], remaining[0],
                                        not_following)
-            found.append(_Choice(slot, mapping[slot], remaining, reason))
-    return sorted(found, key=lambda choice: list(INPUTS).index(choice.slot))
+            choices.append(_Choice(slot, mapping[slot], remaining, reason))
+    return sorted(choices, key=lambda choice: list(INPUTS).index(choice.slot))
 
 
 def _choice_of_user(bag: 'Bag', choice: _Choice) -> _Choice:

@@ -130,10 +130,10 @@ def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | 
     return sides
 
 
-def single_wheel_setting(facts: list[dict[str, Any]], chosen: Sequence[str]) -> tuple[str, ...]:
-    """Return the setting for one wheel, if the values chosen by name do not grow with distance."""
+def single_wheel_setting(facts: list[dict[str, Any]], named: Sequence[str]) -> tuple[str, ...]:
+    """Return the setting for one wheel, if those found by name do not grow with distance."""
     growing = [value for value in facts if value['scale']]
-    if not growing or chosen and {value['key'] for value in growing}.issuperset(chosen):
+    if not growing or named and {value['key'] for value in growing}.issuperset(named):
         return ()
     return (f'odometer.field={growing[0]["field"]}[{growing[0]["key"]}]',)
 

@@ -201,11 +201,11 @@ def _table(noise: 'TwistNoise') -> str:
     rates = np.linspace(0.0, noise.fastest[1], 4)
     rows = {f'turn_rate_{k}': {
         'rad_per_s': float(f'{rate:.3g}')} | {
-        name: [float(f'{noise.variances(v, rate)[column]:.3g}') for v in speeds]
+        name: [float(f'{noise.variances(speed, rate)[column]:.3g}') for speed in speeds]
         for name, column in (('x', 0), ('y', 1), ('yaw', 3)) if column < 3 or noise.has_turn_rate}
         for k, rate in enumerate(rates)}
     return parameter_block({'period': float(f'{noise.period:.4g}'),
-                            'speed': [float(f'{v:.3g}') for v in speeds], **rows},
+                            'speed': [float(f'{speed:.3g}') for speed in speeds], **rows},
                            'wheel_odometry_covariance')
 
 
@@ -240,7 +240,8 @@ def _imu_errors_of(details: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     errors |= {f'accelerometer_bias_{axis}': bias
                for axis, bias in details.get('accelerometer_bias', {}).items()
                if bias['ratio'] < INFORMED_SHARE}
-    return {name: {key: one[key] for key in ('value', 'sigma')} for name, one in errors.items()}
+    return {name: {key: entry[key] for key in ('value', 'sigma')}
+            for name, entry in errors.items()}
 
 
 def head(calibration: Calibration, content: dict[str, Any]) -> str:
@@ -251,8 +252,8 @@ def head(calibration: Calibration, content: dict[str, Any]) -> str:
 def about(calibration: Calibration, content: dict[str, Any]) -> str:
     """Return two lines: software, date, legs and bags of the file; its result."""
     inputs = content['inputs']
-    bags = ', '.join(str(i['bag']) for i in inputs if i.get('bag')) or 'live'
-    bags += ''.join(f', node {i["node"]}' for i in inputs if i.get('node'))
+    bags = ', '.join(str(entry['bag']) for entry in inputs if entry.get('bag')) or 'live'
+    bags += ''.join(f', node {entry["node"]}' for entry in inputs if entry.get('node'))
     bags += f', vehicle {content["vehicle"]}' if content.get('vehicle') else ''
     return (f'{content["software"]}, {content["created"]}, '
             f'{counted(len(calibration.legs), "leg")}, from: {one_line(bags)}\n'

@@ -102,7 +102,7 @@ def _autoware(calibration: Calibration, config: Config, content: dict[str, Any])
 
 def _speed_factor(calibration: Calibration) -> float | None:
     """Return the factor for raw speeds; for pulses only with a nominal scale."""
-    scale, ratio = (calibration.estimates.get(n) for n in ('scale_factor', 'scale_ratio'))
+    scale, ratio = (calibration.estimates.get(name) for name in ('scale_factor', 'scale_ratio'))
     if scale is not None and scale.unit == '1':
         return calibration.estimates.get('scale_factor_as_sent', scale).value
     return None if ratio is None else ratio.value
@@ -111,7 +111,8 @@ def _speed_factor(calibration: Calibration) -> float | None:
 def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
     """Return the gyro bias in the axes and raw unit of the IMU messages, (3,), None if unknown."""
     estimates = [calibration.estimates.get(f'gyro_bias_{axis}') for axis in AXES]
-    bias = [e.value for e in estimates if e is not None and e.value is not None]
+    bias = [estimate.value for estimate in estimates
+            if estimate is not None and estimate.value is not None]
     C_bi = next((leg.C_bi for leg in calibration.legs if leg.C_bi is not None), None)
     if C_bi is None or len(bias) < len(AXES):
         return None
@@ -123,8 +124,8 @@ def _transform(calibration: Calibration, config: Config,
     """Return the transform of the IMU as launch file, URDF joint and command; {} if unknown."""
     if calibration.imu_rotation_rpy is None:
         return {}
-    xyz = [repr(float(v)) for v in config.imu.lever_arm]
-    rpy = [repr(float(v)) for v in calibration.imu_rotation_rpy]
+    xyz = [repr(float(length)) for length in config.imu.lever_arm]
+    rpy = [repr(float(angle)) for angle in calibration.imu_rotation_rpy]
     base, imu = config.frames.base, config.frames.imu or IMU_FRAME
     name = re.sub(r'\W', '_', f'{base}_to_{imu}')        # a node's name has no / . -
     words = [word for option, value in zip((*AXES, 'roll', 'pitch', 'yaw'), (*xyz, *rpy),
@@ -137,8 +138,8 @@ def _transform(calibration: Calibration, config: Config,
     launch = ElementTree.Element('launch')
     ElementTree.SubElement(launch, 'node', pkg='tf2_ros', exec='static_transform_publisher',
                            name=name, args=text_formats.for_launch(words))
-    assumed = '' if any(config.imu.lever_arm) else ' (not set)'
-    head = (f'{device_files.about(calibration, content)}\ntranslation: imu.lever_arm{assumed}; '
+    not_set = '' if any(config.imu.lever_arm) else ' (not set)'
+    head = (f'{device_files.about(calibration, content)}\ntranslation: imu.lever_arm{not_set}; '
             f'{not_estimated(calibration)} as configured')
     command = (text_formats.for_comment(
         f'{head}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
@@ -177,7 +178,7 @@ def with_imu_frame(calibration: Calibration, config: Config,
 
 def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """Return file name -> text, empty if no leg has a track."""
-    # a file stays small with many legs: three tracks of each share this number of points
+    # a file stays small with many legs: the tracks, three of each leg, share its points
     tracks, file_points = 3 * max(1, len(calibration.legs)), 150_000
     max_points = max(2, min(MAX_TRACK_POINTS, file_points // tracks))
     shapes = [feature for n, leg in enumerate(calibration.legs, 1)
@@ -199,20 +200,20 @@ def features(number: int, leg: LegResult, max_points: int) -> list[dict[str, Any
         return {'type': 'Feature', 'geometry': geometry,
                 'properties': {'kind': kind, 'leg': number, 'bag': leg.bag,
                                'verdict': leg.verdict.value, **properties}}
-    found = []
+    shapes = []
     for kind, rows, geometry in (('corrected', leg.track_n, _line),
                                  ('as_configured', leg.track_before_n, _line),
                                  ('fixes', leg.reference_n, lambda rows: {
                                      'type': 'MultiPoint', 'coordinates': rows.tolist()})):
         positions = _positions(rows, leg, max_points)
         if rows is not None and len(positions):
-            found.append(feature(geometry(positions), kind, points=len(positions), of=len(rows)))
+            shapes.append(feature(geometry(positions), kind, points=len(positions), of=len(rows)))
     track = _positions(leg.track_n, leg, max_points)
     if len(track):
         for name, row, stamp_ns in (('start', 0, leg.start_ns), ('stop', -1, leg.stop_ns)):
             point = {'type': 'Point', 'coordinates': track[row].tolist()}
-            found.append(feature(point, 'mark', mark=name, stamp_ns=stamp_ns))
-    return found
+            shapes.append(feature(point, 'mark', mark=name, stamp_ns=stamp_ns))
+    return shapes
 
 
 def _positions(rows_n: Floats | None, leg: LegResult, max_points: int) -> Floats:

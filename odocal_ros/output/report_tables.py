@@ -183,7 +183,7 @@ def unused_data(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reas
                          f'{reason}; first at t = {min(t):.1f} s, last at t = {max(t):.1f} s'))
     elif leg.rejected_fixes:
         rows.append((f'{leg.rejected_fixes} fixes', 'see the reasons'))
-    return rows, [r for r in leg.reasons if r.code in DATA_CODES]
+    return rows, [reason for reason in leg.reasons if reason.code in DATA_CODES]
 
 
 def changed_settings(config: Config) -> list[tuple[str, str, str]]:
@@ -195,7 +195,7 @@ def changed_settings(config: Config) -> list[tuple[str, str, str]]:
 
 def _shown(value: Any) -> str:
     if isinstance(value, tuple):
-        return f'[{", ".join(_shown(v) for v in value)}]'
+        return f'[{", ".join(map(_shown, value))}]'
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value) if isinstance(value, float) else str(value) or "''"
@@ -221,10 +221,11 @@ def versions(software: str) -> list[tuple[str, str]]:
     """Return (name, version) of odocal_ros, Python and the installed packages it uses."""
     from importlib.metadata import PackageNotFoundError, version
     import platform
-    found = [('odocal_ros', software.rpartition(' ')[2]), ('Python', platform.python_version())]
+    installed = [('odocal_ros', software.rpartition(' ')[2]),
+                 ('Python', platform.python_version())]
     for name in ('numpy', 'scipy', 'pyproj', 'rosbags', 'matplotlib', 'jinja2'):
         try:
-            found.append((name, version(name)))
+            installed.append((name, version(name)))
         except PackageNotFoundError:
             continue
-    return found
+    return installed

@@ -132,8 +132,8 @@ def method_lines(calibration: result.Calibration) -> list[str]:
         return []
     rows: list[tuple[str, ...]] = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
     for name, method in methods.items():
-        scale, *angles = (texts.finite_estimate(method.estimates, n)
-                          for n in ('scale_factor', *texts.ANGLES))
+        scale, *angles = (texts.finite_estimate(method.estimates, parameter)
+                          for parameter in ('scale_factor', *texts.ANGLES))
         rows.append((name, '-' if scale.value is None
                      else texts.with_sigma(scale.value, scale.sigma),
                      *('-' if angle.value is None else
@@ -161,7 +161,7 @@ def largest_source(method: result.MethodResult | None, name: str) -> tuple[str, 
     if method is None or name not in method.parameters:
         return '', 0.0
     row = method.parameters.index(name)
-    variances = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
+    variances = {source.name: float((source.effects[row]**2).sum()) for source in method.sources}
     largest, total = max(variances, key=variances.__getitem__, default=''), sum(variances.values())
     return (largest, variances[largest] / total) if total else ('', 0.0)
 

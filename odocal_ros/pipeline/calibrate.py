@@ -195,30 +195,31 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
                 if progress is not None:
                     progress(replace(stage, done=(k + stage.done) / len(parts)))
             results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
-        return [one for one in results if one.verdict is not Verdict.REJECTED]
+        return [result for result in results if result.verdict is not Verdict.REJECTED]
 
-    good, carried_reason = usable_results(
-        parts_between(leg, imu_gaps(leg, config.leg.max_gap))), None
-    if not good:
-        of_leg = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
-        carried_reason = next((r for r in of_leg.reasons if r.code is Code.ODOMETER_STILL), None)
-        if carried_reason:
-            good = usable_results(parts_between(leg, _carried_sections(leg, config)))
-        if not good:
-            return [of_leg]
-    if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
-        return good      # the gap is before the mark
-    cause, do = (carried_reason.text,
-                 'If the vehicle was carried (ferry, train), ignore. Otherwise check '
-                 'the wheel sensor and the odometer topic.') if carried_reason else (
-        f'no IMU data for more than {config.leg.max_gap:g} s', '')
-    return [replace(one, cut_from_ns=leg.start_ns, reasons=(*one.reasons, Reason(
-        Code.LEG_CUT, f'{cause}; {_section_text(leg, one, len(good))}', do))) for one in good]
+    usable = usable_results(parts_between(leg, imu_gaps(leg, config.leg.max_gap)))
+    cause, remedy = f'no IMU data for more than {config.leg.max_gap:g} s', ''
+    if not usable:
+        whole_leg = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
+        still_reason = next((reason for reason in whole_leg.reasons
+                             if reason.code is Code.ODOMETER_STILL), None)
+        if still_reason:
+            usable = usable_results(parts_between(leg, _carried_sections(leg, config)))
+            cause, remedy = still_reason.text, (
+                'If the vehicle was carried (ferry, train), ignore. Otherwise check the wheel '
+                'sensor and the odometer topic.')
+        if not usable:
+            return [whole_leg]
+    if [(part.start_ns, part.stop_ns) for part in usable] == [(leg.start_ns, leg.stop_ns)]:
+        return usable      # the gap is before the mark
+    return [replace(part, cut_from_ns=leg.start_ns, reasons=(*part.reasons, Reason(
+        Code.LEG_CUT, f'{cause}; {_section_text(leg, part, len(usable))}', remedy)))
+        for part in usable]
 
 
-def _section_text(leg: Leg, one: LegResult, count: int) -> str:
-    """Return the span of one of ``count`` sections within its leg, as text."""
-    begin, end = ((t - leg.start_ns) * 1e-9 for t in (one.start_ns, one.stop_ns))
+def _section_text(leg: Leg, part: LegResult, count: int) -> str:
+    """Return the span of one of ``count`` parts of a leg, as text."""
+    begin, end = ((t - leg.start_ns) * 1e-9 for t in (part.start_ns, part.stop_ns))
     return (f'this section covers {begin:.1f} to {end:.1f} s of the '
             f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s leg'
             + (f', one of {count} sections' if count > 1 else

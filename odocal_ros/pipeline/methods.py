@@ -163,8 +163,8 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
                 methods[name] = replace(run.result, details=run.result.details | check)
                 reasons += track_reasons
     # outlier fixes are reported once, by the first method or track
-    of_outliers = [k for k, r in enumerate(reasons) if r.code is Code.BAD_ROWS_DROPPED]
-    reasons = [r for k, r in enumerate(reasons) if k not in of_outliers[1:]]
+    on_outliers = [k for k, reason in enumerate(reasons) if reason.code is Code.BAD_ROWS_DROPPED]
+    reasons = [reason for k, reason in enumerate(reasons) if k not in on_outliers[1:]]
     return leg_result(leg, inputs, (*prepared.reasons, *reasons), methods,
                       deciding=choice.deciding_methods(selected_method),
                       distance=prepared.distance, path_ratio=prepared.path_ratio, **track_fields)

@@ -47,7 +47,7 @@ def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
                progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     inputs, screening_reasons = screen(leg, config, check_faults=False)
-    reasons = [*notes, *(r for r in screening_reasons if r.code not in IMU_CODES)]
+    reasons = [*notes, *(reason for reason in screening_reasons if reason.code not in IMU_CODES)]
     progress(Stage(PLANAR))
     run, missing = _make_run(inputs, config)
     if run is None:
@@ -88,9 +88,9 @@ def _make_run(inputs: Inputs, config: settings.Config) -> tuple[planar.Run | Non
     travels, kind = inputs.travels, config.odometer.drive
     if wrong_count := _wheel_count_reason(kind, len(travels)):
         return None, [wrong_count]
-    low = max(0.0, *(one.t[0] for one in travels))
-    high = min(inputs.t_stop, *(one.t[-1] for one in travels))
-    inside = np.flatnonzero((inputs.t_fix >= low) & (inputs.t_fix <= high))
+    begin = max(0.0, *(travel.t[0] for travel in travels))
+    end = min(inputs.t_stop, *(travel.t[-1] for travel in travels))
+    inside = np.flatnonzero((inputs.t_fix >= begin) & (inputs.t_fix <= end))
     if len(inside) < MIN_POSITIONS:
         return None, [Reason(Code.NO_FIX, f'{len(inside)} positions while the wheels have data; '
                              f'required: {MIN_POSITIONS}')]
@@ -100,7 +100,7 @@ def _make_run(inputs: Inputs, config: settings.Config) -> tuple[planar.Run | Non
     position = median_origin(inputs.t_fix, inputs.geodetic).to_n(place[used])[:, :2]
     covariance = inputs.covariance_n[used]
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
-    steps = np.array([np.diff(one.at(t)) for one in travels])
+    steps = np.array([np.diff(travel.at(t)) for travel in travels])
     if kind in settings.HOLONOMIC:
         rows = planar.wheel_rows(kind, len(steps), config.odometer.wheel_offset)
         wheels = planar.Wheels(steps.T, rows, kind)

@@ -114,9 +114,9 @@ def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reaso
             Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale',
             'Drive farther between the marks. If the vehicle did, check the receiver (static '
             'hold off).'),)
-    covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
+    between_marks = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
     min_rows = 4    # of the IMU between the marks, for an attitude
-    if covered.sum() < min_rows:
+    if between_marks.sum() < min_rows:
         return imu_gap(inputs.t_imu, 0.0, inputs.t_stop, 0.0)
     return None
 

@@ -118,18 +118,19 @@ class PreparedLeg(LocatedFixes):
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
 
     @property
-    def covered(self) -> tuple[float, float]:
-        """Return begin and end of the time with track and odometer, s."""
-        each = self.track.t, self.inputs.travel.t
-        return max(0.0, *(float(t[0]) for t in each)), min(float(t[-1]) for t in each)
+    def time_span(self) -> tuple[float, float]:
+        """Return begin and end of the time that track and odometer cover, s."""
+        times = self.track.t, self.inputs.travel.t
+        return max(0.0, *(float(t[0]) for t in times)), min(float(t[-1]) for t in times)
 
     @cached_property
     def path_ratio(self) -> float | None:
         """Return metres per unit of travel by fixes along ``level_path``, None if they stand."""
         t, travel = self.inputs.t_fix, self.inputs.travel
-        k = (t >= max(travel.t[0], self.track.t[0])) & (t <= min(travel.t[-1], self.track.t[-1]))
+        inside = (t >= max(travel.t[0], self.track.t[0])) & (
+            t <= min(travel.t[-1], self.track.t[-1]))
         return dead_reckoning.section_ratio(
-            travel.at(t[k]), self.level_path(t[k]), self.fixes_n[k, :2],
+            travel.at(t[inside]), self.level_path(t[inside]), self.fixes_n[inside, :2],
             max(self.inputs.min_motion, 8 * self.fix_sigma))
 
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
@@ -140,11 +141,11 @@ class PreparedLeg(LocatedFixes):
             return MarkFix(t, self.origin.to_n(position), np.eye(3) * point[3]**2,
                            standing_at(t, self.spans) is not None, 0, surveyed=True)
         inputs, at_mark_n = self.inputs, path(np.array(t))
-        rhythm = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
+        interval = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
         return fix_at(t, standing_at(t, self.spans),
                       (inputs.t_fix, self.fixes_n, inputs.covariance_n),
                       lambda times: path(times) - at_mark_n,
-                      self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * rhythm))
+                      self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * interval))
 
     def _surveyed(self, name: str, t: float) -> tuple[float, ...]:
         """Return the reference point at a mark, () if the path does not start or end there."""
@@ -207,7 +208,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
                                                                 tuple[Reason, ...]]:
     """Return tracks, checks and evidence of a leg as fields of its result, and reasons."""
     before, after = paths
-    start = prepared.mark(prepared.covered[0], after, 'start')
+    start = prepared.mark(prepared.time_span[0], after, 'start')
     if start is None:
         return {}, ()
     t = prepared.track.t[::max(1, len(prepared.track.t) // KEPT_ROWS)]
@@ -230,7 +231,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     fields['per_distance'] = track_check.errors_per_distance(*errors)
     kept, outlier_reasons = without_outliers(prepared, after, start, between)
     evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
-                             start, paths, prepared.config, prepared.t_fit, prepared.covered)
+                             start, paths, prepared.config, prepared.t_fit, prepared.time_span)
     return fields | {'evidence': evidence}, (
         *section_reasons, *track_check.worse_check_reasons(*errors, bool(prepared.nominal_scale)),
         *outlier_reasons, *counter_change_reasons(evidence.sections, evidence.t_fix,
@@ -239,7 +240,7 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
 
 def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:
     """Return the check of a method's own path as an entry of its details, and reasons."""
-    start = prepared.mark(prepared.covered[0], path, 'start')
+    start = prepared.mark(prepared.time_span[0], path, 'start')
     if start is None:
         return {}, ()
     pin, between, path_length, reasons = _compared_section(prepared, path, start)
@@ -252,14 +253,19 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
 
 def _compared_section(prepared: PreparedLeg, path: Path,
                       start: MarkFix) -> tuple[MarkFix | None, Bools, float, tuple[Reason, ...]]:
-    """Return the pin of the path, a mask of fixes to compare, path length, m, and reasons."""
+    """
+    Return the section in which a path is compared with the fixes.
+
+    That is: the mark at which both are equal (pin), a mask of the fixes, the path length, m, and
+    reasons.
+    """
     pin: MarkFix | None = start
     begin, end = start.t, prepared.t_fit
     reasons: tuple[Reason, ...] = ()
     if prepared.holdout:
         pin = prepared.mark(prepared.t_fit, path)
         begin, end = prepared.t_fit, prepared.inputs.t_stop
-    end = min(end, prepared.covered[1])
+    end = min(end, prepared.time_span[1])
     between = (prepared.inputs.t_fix >= begin) & (prepared.inputs.t_fix <= end)
     if pin is not None:
         inside, reasons = without_outliers(prepared, path, pin, between)

@@ -82,17 +82,17 @@ class TwoPointRun:
         forward = corrected_forward_axis(self.prepared.imu_orientation, f)
         slips = slip_check(self.prepared, self.track, forward, ends)
         self.slip_reasons = slip_reasons(slips, self.config.odometer.time_offset)
-        one = self.prepared.wheel_slips      # of single wheels: 1 / count in the mean
-        inside = (one.t >= ends[0]) & (one.t <= ends[1])
-        return (np.append(slips.t, one.t[inside]),
-                np.append(slips.size, one.size[inside] / one.count))
+        of_wheel = self.prepared.wheel_slips      # of single wheels: 1 / count in the mean
+        inside = (of_wheel.t >= ends[0]) & (of_wheel.t <= ends[1])
+        return (np.append(slips.t, of_wheel.t[inside]),
+                np.append(slips.size, of_wheel.size[inside] / of_wheel.count))
 
     def _chord(self) -> Chord | None:
         """Return the chord between the marks; None, with a reason, without fixes."""
         prepared, track = self.prepared, self.track
         path = prepared.path(np.array([prepared.rough_scale, 0.0, 0.0]))
-        start = prepared.mark(prepared.covered[0], path, 'start')
-        end = prepared.mark(min(prepared.t_fit, prepared.covered[1]), path, 'end')
+        start = prepared.mark(prepared.time_span[0], path, 'start')
+        end = prepared.mark(min(prepared.t_fit, prepared.time_span[1]), path, 'end')
         self.reasons += [Reason(Code.NO_FIX, f'no usable fix at the {name} mark')
                          for name, mark in (('start', start), ('end', end)) if mark is None]
         if start is None or end is None:

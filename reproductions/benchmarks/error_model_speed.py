@@ -15,12 +15,12 @@ HOUR, RATE = 3600, 50
 
 def best_of(run, times=5):
     """Return the shortest wall time of a few runs, s."""
-    spans = []
+    wall_times = []
     for _ in range(times):
         begin = time.perf_counter()
         run()
-        spans.append(time.perf_counter() - begin)
-    return min(spans)
+        wall_times.append(time.perf_counter() - begin)
+    return min(wall_times)
 
 
 def main():

@@ -132,8 +132,7 @@ class PaperDrive:
         north, east = plane_for(self.config.projection, meridian).forward(
             path.latitude, path.longitude)
         north, east = north - north[0], east - east[0]
-        dx, dy = plane_error(path.latitude, path.longitude, meridian,
-                             x[:, LAT], x[:, LON])
+        dx, dy = plane_error(path.latitude, path.longitude, meridian, x[:, LAT], x[:, LON])
         chord = np.hypot(north, east)
         with np.errstate(invalid='ignore', divide='ignore'):
             _, yaw = chord_error(north, east, dx, dy, chord, 1.0)

@@ -150,8 +150,7 @@ def embodiment(leg: PlanarLeg, radius: float = NOMINAL_RADIUS,
         left, right, heading_deg = errors
         return row(name, np.array([left / radius, right / radius, np.deg2rad(heading_deg)]))
 
-    best = (row(f'best of {len(array)}', best_x),
-            row(f'best of all {len(all_x)}', best_of_all_x))
+    best = (row(f'best of {len(array)}', best_x), row(f'best of all {len(all_x)}', best_of_all_x))
     rows = [row_of('start values', (0.0, 0.0, 0.0))]
     rows += [row_of(f'printed {k}', errors) for k, errors in enumerate(PRINTED, 1)]
     rows += [row_of('printed as best', PRINTED_BEST), *best,
