@@ -97,7 +97,6 @@ def with_columns(leg, slot, **columns):
 
 
 def kept(leg, slot, rows):
-    """Return a leg with some rows of a topic."""
     return leg.with_rows(**{slot: take(leg.rows(slot), rows)})
 
 
@@ -126,7 +125,6 @@ def shifted(leg, **marks):
 
 
 def planned(motion, options):
-    """Return the drive of a simulated motion as a planned one."""
     t = np.arange(0.0, motion.duration + 1e-9, 0.1)
     return drive_from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
                             latitude=options.latitude, longitude=options.longitude,
@@ -138,7 +136,6 @@ def two_point(leg, config, **more):
 
 
 def reason_texts(result):
-    """Return the texts of all reasons of a leg, by code."""
     reasons = [*result.reasons, *(r for m in result.methods.values() for r in m.reasons)]
     return {r.code: r.text for r in reasons}
 
@@ -163,7 +160,6 @@ def off(found, made, *names):
 
 
 def rejecting(result):
-    """Return the codes for which a leg is rejected."""
     return {c for c in reason_texts(result) if c.severity.value == 'rejected'}
 
 

@@ -132,7 +132,6 @@ def transform(stamp_ns, position, child='robot', frame='world'):
 
 
 def odometry(stamp_ns, x, child='base_link', frame='odom'):
-    """Return a nav_msgs/Odometry with a forward speed."""
     inner = kind('geometry_msgs/msg/PoseWithCovariance')(pose=pose_at((1.0, 2.0, 3.0)),
                                                          covariance=np.arange(36.0))
     moves = kind('geometry_msgs/msg/TwistWithCovariance')(twist=twist(x), covariance=np.zeros(36))

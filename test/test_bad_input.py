@@ -213,12 +213,9 @@ def test_an_imu_with_z_down_is_detected_and_used(town):
     assert rpy[2] == pytest.approx(town.truth.yaw, abs=0.01)
 
 
-def test_a_gyro_with_the_wrong_sign_is_reported(town):
+def test_a_gyro_with_the_wrong_sign_and_a_rotation_by_90_deg_are_reported(town):
     _, said = run(with_columns(town.leg(), 'imu', w_i=lambda a: a * [1.0, 1.0, -1.0]), town)
     assert set(said) == {Code.GYRO_SIGN}, 'one cause, and nothing that follows from it'
-
-
-def test_a_rotation_by_90_deg_is_reported_with_the_setting_for_it(town):
     result, _ = run(with_columns(town.leg(), 'imu', w_i=sideways, f_i=sideways), town)
     (reason,) = (r for r in result.reasons if r.code is Code.IMU_AXES)
     rpy = json.loads(re.search(r"--set 'imu.mounting_rpy=(\[.*?\])'", reason.remedy)[1])

@@ -63,7 +63,6 @@ def put_bag(path, made, names=DEFAULTS):
 
 
 def printed(words, capfd, code=0):
-    """Return the printed text of a command that ends with a code."""
     capfd.readouterr()
     ended = cli.main(words)
     out, err = capfd.readouterr()

@@ -61,7 +61,6 @@ NAMES = re.compile(r'``[^`\n]*``|`[^`\n]*`|\{[^{}]*\}|\$[^$]*\$|\([^() ]*\.md\)|
 
 
 def unused(text):
-    """Return the words in a text that are not used, but for names."""
     return [match.group() for match in UNUSED.finditer(NAMES.sub(' ', text))]
 
 

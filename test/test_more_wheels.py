@@ -52,7 +52,6 @@ def codes(reasons):
 
 
 def with_dead(one, dead):
-    """Return the leg of a drive on which some wheels do not count."""
     return one.leg().with_rows(**{WHEELS[k]: changed(one.wheels[k], value=lambda a: 0 * a)
                                   for k in dead})
 
@@ -90,16 +89,6 @@ def test_a_reversed_wheel_of_each_axle_is_reported():
     inputs, found = screen(leg, config(one))
     assert [reason.code for reason in found].count(Code.WHEEL_REVERSED) == 2
     assert len(inputs.travels) == 4
-
-
-def test_each_axle_has_its_track_width():
-    one, method = calibrated()
-    widths = [name for name in method.estimates if name.startswith('track_width')]
-    assert widths == ['track_width_front_left_front_right', 'track_width_rear_left_rear_right']
-    for name in widths:
-        e = method.estimates[name]
-        assert abs(e.value - one.options.track_width) < SIGMAS * e.sigma
-        assert e.sigma < 0.03 * e.value
 
 
 def test_the_mean_is_that_of_the_wheels_that_do_not_steer():
@@ -211,8 +200,15 @@ def test_the_wheel_that_deviates_is_reported():
     assert departing(fl=1.03, fr=1.031, rl=1.0, rr=1.001) == ''
 
 
-def test_wheels_are_grouped_in_pairs():
+def test_each_axle_is_a_pair_of_wheels_with_its_track_width():
     assert pair_wheels(('a', 'b', 'c', 'd', 'e')) == [('a', 'b'), ('c', 'd'), ('e',)]
+    one, method = calibrated()
+    widths = [name for name in method.estimates if name.startswith('track_width')]
+    assert widths == ['track_width_front_left_front_right', 'track_width_rear_left_rear_right']
+    for name in widths:
+        e = method.estimates[name]
+        assert abs(e.value - one.options.track_width) < SIGMAS * e.sigma
+        assert e.sigma < 0.03 * e.value
 
 
 def test_the_summary_has_a_line_for_each_wheel():

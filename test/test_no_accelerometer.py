@@ -26,7 +26,6 @@ def without_force(made, value=0.0, planar=False):
 
 @cached
 def calibrated(how='zero', **options):
-    """Return a drive, its settings and the result of its leg without force."""
     made = drive(**TOWN | options)
     config = settings(made, heading_sigma=None, method='auto')
     leg = without_force(made, np.nan if how == 'nan' else 0.0, how == 'yaw rate alone')

@@ -114,7 +114,6 @@ def counted():
 
 @pytest.fixture(scope='module')
 def whole(counted):
-    """Return the poses of that drive without faults."""
     return poses_of(odometry_of(counted), samples_of(counted), counted.form)
 
 

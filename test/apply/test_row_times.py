@@ -202,13 +202,10 @@ def test_a_delay_is_found_in_the_presence_of_a_bias(late):
     assert search.sigma_s >= abs(expected) - 0.01
 
 
-def test_without_a_delay_nothing_is_reported():
+def test_no_delay_is_reported_without_one_or_from_less_than_a_minute():
     search, notes = searched(0.0)
     assert not notes
     assert search.sigma_s == 0.01
-
-
-def test_a_minute_is_needed_and_unusable_seconds_do_not_count():
     assert not searched(0.2, seconds=MIN_DELAY_ROWS)[1]
     search = DelaySearch(0.0, 0.01, [])
     assert not any(search.add(FORWARD, None, (0.0, 0.0, GRAVITY), 1.0) for _ in range(500))

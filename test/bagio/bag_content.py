@@ -28,7 +28,6 @@ def contents(bag):
 
 
 def read(path):
-    """Return the rows of a bag, and its notes."""
     with open_bag(path) as bag:
         return contents(bag), bag.notes
 
@@ -39,7 +38,6 @@ def same(found, expected):
 
 
 def file_of(path):
-    """Return the file with the messages of a bag."""
     return path if path.is_file() else next(f for f in path.iterdir() if f.suffix != '.yaml')
 
 

@@ -10,7 +10,6 @@ import ros_bags
 
 @pytest.fixture(scope='session')
 def plain(tmp_path_factory):
-    """Return a plain mcap bag of ten seconds."""
     return ros_bags.write(tmp_path_factory.mktemp('plain') / 'drive', ros_bags.drive())
 
 

@@ -94,7 +94,6 @@ NO_SCATTER = 1e-9, 1e-9, 1e-9       # sigma of the change of ln K, yaw and pitch
 
 
 def moved(result, name, by):
-    """Return a result with one constant of its marginal information shifted."""
     marginal = result.marginal
     at = np.arange(len(marginal.names)) == marginal.names.index(name)
     return replace(result, marginal=replace(marginal, point=marginal.point + by * at))

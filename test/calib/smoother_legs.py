@@ -39,18 +39,15 @@ def made(**options):
 
 @cached
 def smoothed(**options):
-    """Return a drive and the result of the smoother."""
     drive, config, leg = made(**options)
     return drive, smooth(leg, config)
 
 
 def reason_texts(result):
-    """Return the texts of the reasons of a result, by code."""
     return {reason.code: reason.text for reason in result.reasons}
 
 
 def leg_of(leg, config):
-    """Return a leg in the format of the smoother."""
     inputs, _ = screen(leg, config)
     located = locate_fixes(inputs, config)
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, located.rough_scale,

@@ -37,7 +37,6 @@ def several(*methods):
 
 
 def chosen(methods, setting, name='scale_factor'):
-    """Return the chosen value and the methods that determine it."""
     estimates, giving = choice.choose(methods, setting)
     return estimates[name].value, giving
 
@@ -110,7 +109,6 @@ def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause(other,
 
 
 def leg(number, *methods, reasons=()):
-    """Return a leg of its own hour."""
     start = number * 3600 * 10**9
     return LegResult(start, start + 10**11, 1000.0, 100.0, 10_000, 5000, 500, 0, tuple(reasons),
                      several(*methods), C_bi=np.eye(3))
@@ -144,7 +142,7 @@ def test_method_rejected_on_every_leg_stays_rejected_in_the_combination():
     assert whole.methods['two_point'].verdict is Verdict.REJECTED
 
 
-def test_rejection_of_a_leg_is_reported_once():
+def test_rejection_of_a_leg_or_of_its_method_is_reported_once():
     fell = Reason(Code.ODOMETER_REVERSED, 'by the method')
     rejected = leg(1, method('smoother', reasons=[fell]), method('two_point'),
                    reasons=[Reason(Code.ODOMETER_REVERSED, 'by the leg')])
@@ -153,9 +151,6 @@ def test_rejection_of_a_leg_is_reported_once():
     assert text == 'leg 1: rejected and not used: by the leg'
     alone = combine([leg(1, method('smoother', reasons=[fell]), reasons=rejected.reasons)], ALL)
     assert [r.text for r in alone.reasons if r.code is fell.code] == ['by the leg']
-
-
-def test_method_missing_in_one_leg_of_two_is_reported_once():
     fell = method('smoother', reasons=[REFUSED])
     one = leg(1, fell, method('two_point'),
               reasons=choice.rejected_method_reasons(several(fell, method('two_point')), 'all'))
@@ -167,7 +162,6 @@ def test_method_missing_in_one_leg_of_two_is_reported_once():
 
 
 def driven(number, scale=0.02, sigma=2e-6, yaw=0.01, yaw_sigma=1e-4, unit='m/pulse'):
-    """Return an accepted leg."""
     one = method('two_point')
     return leg(number, replace(one, estimates=one.estimates | {
         'scale_factor': Estimate(scale, sigma, unit),

@@ -95,7 +95,7 @@ def test_scatter_beyond_the_sigmas_is_named_and_widens_the_sigma():
                                      'uncertainties')
 
 
-def test_scatter_explained_by_the_common_error_is_not_a_disagreement():
+def test_scatter_by_a_common_error_or_a_new_bias_is_not_a_disagreement():
     """The heading error may affect two legs differently; the difference is accounted for."""
     legs = [method(yaw=0.01 + heading, heading=heading) for heading in (1e-3, -1e-3)]
     assert combine_method('two_point', legs).reasons == ()
@@ -105,10 +105,7 @@ def test_scatter_explained_by_the_common_error_is_not_a_disagreement():
         legs = [method(scale=0.02 * np.exp(NOISE * z)) for z in rng.standard_normal(4)]
         named += any(r.text.startswith('scale') for r in combine_method('two_point', legs).reasons)
     assert 0.02 < named / 400 < 0.09      # 5 % +- 3 * 1.1 %, and 1 % for the approximation
-
-
-def test_new_accelerometer_bias_of_each_leg_is_not_a_disagreement():
-    """Two power-ups have two accelerometer biases: accounted for, but not averaged down."""
+    # two power-ups have two accelerometer biases: accounted for, but not averaged down
     def pitched(value):
         one = method()
         return replace(one, estimates=one.estimates | {PITCH: Estimate(value, 5e-4, 'rad')})
@@ -119,7 +116,6 @@ def test_new_accelerometer_bias_of_each_leg_is_not_a_disagreement():
 
 
 def weekly(scales):
-    """Return the combination of one leg per week."""
     week = 7 * 86_400 * 10**9
     return combine([replace(leg(method(scale=scale)), start_ns=k * week, stop_ns=k * week + 900)
                     for k, scale in enumerate(scales)], CONFIG)

@@ -92,7 +92,6 @@ def test_excluded_fixes_are_named_with_the_reason():
 
 
 def straight(path):
-    """Return a straight path to the east: (n, 3)."""
     return np.outer(path, [1.0, 0.0, 0.0])
 
 

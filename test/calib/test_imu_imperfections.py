@@ -30,7 +30,6 @@ TOWN = {'scenario': 'town', 'duration': 250.0, 'imu_grade': 'industrial', 'sway'
 
 
 def of_grade(config, *names):
-    """Return settings with the IMU errors of its grade."""
     return with_settings(config, {f'imu.{name}_sigma': np.nan for name in names})
 
 

@@ -28,13 +28,10 @@ def leg(step_w, step_f, noise=0.5, n=20_000):
     return SimpleNamespace(t_imu=np.arange(n) / RATE, w_b=w, f_b=f)
 
 
-def test_quantisation_step_of_a_signal_is_found_or_zero():
+def test_quantisation_step_is_found_and_explains_only_noise_of_its_size():
     without_noise = {'gyro': 0.0, 'accel': 0.0}       # any step explains zero noise
     assert find_quantisation_steps(leg(np.deg2rad(0.25), 0.0), without_noise) == {
         'gyro': pytest.approx(np.deg2rad(0.25), rel=0.01)}
-
-
-def test_quantisation_explains_only_noise_of_its_size():
     step = 0.125
     white = step * np.sqrt(1 / 12 / RATE)        # closed form of rounding
     coarse = leg(0.0, step)

@@ -275,7 +275,7 @@ def test_each_kind_has_a_separate_walk_level():
     assert np.abs(np.log(fit_regression(seen).levels / walk)).max() < 4 * np.sqrt(2 / 300) + 0.02
 
 
-def test_outlying_increments_have_less_weight():
+def test_outlying_and_uncertain_increments_have_less_weight():
     seen = increments()
     jumps = np.zeros(K)
     jumps[[50, 120, 200]] = 0.3, 0.2, -0.1       # m, with a walk of 1 mm
@@ -284,9 +284,6 @@ def test_outlying_increments_have_less_weight():
     # with full weight 0.4 m in 3000 m, 2300 sigma
     assert abs(line.x[0] - clean.x[0]) < 2 * sigma
     assert np.sqrt(line.covariance[0, 0]) < 2 * sigma
-
-
-def test_increment_with_a_very_large_sigma_has_no_effect():
     seen = increments(reading=1e-3**2)
     walk_time, y = seen.walk_time.copy(), seen.y.copy()
     walk_time[100:103], y[100:103] = 1e10, 5.0

@@ -77,7 +77,6 @@ def legs_of(results, change=0.0, since=2):
 
 
 def compare(found, whole, share):
-    """Compare two calibrations within a share of their sigmas."""
     for name in (SCALE, YAW):
         a, b = found.estimates[name], whole.estimates[name]
         assert a.value == pytest.approx(b.value, abs=share * b.sigma), name

@@ -81,13 +81,10 @@ def test_van_that_rocks_at_its_stops_has_no_noisy_accelerometer(loaded_s, most):
     assert 0.75 * 1e-3 < sigma < most * 1e-3
 
 
-def test_rounding_error_at_standstill_counts_once():
+def test_rounding_error_at_standstill_counts_once_and_is_not_wheel_slip():
     still = np.array([1, 1, 0, 0, 1, 0, 1, 1, 1], bool)
     assert standstill_weights(still) == pytest.approx([1/2, 1/2, 1, 1, 1, 1, 1/3, 1/3, 1/3])
     assert standstill_weights(np.zeros(3, bool)) == pytest.approx(1.0)
-
-
-def test_counter_at_standstill_is_not_wheel_slip():
     _, config, leg = made(imu_grade='industrial', fix_noise='rtk', duration=400.0)
     level = smooth(leg, config).details['noise']
     # wheels without slip; the rounding, 5.8 mm, once per stop of a minute would be 0.75 mm
@@ -95,7 +92,6 @@ def test_counter_at_standstill_is_not_wheel_slip():
 
 
 def by_grade(config):
-    """Return the settings with the IMU errors of its grade."""
     return with_settings(config, {f'imu.{name}_sigma': np.nan for name in (
         'accel_scale', 'misalignment', 'gyro_by_force')})
 

@@ -143,7 +143,7 @@ def test_straight_drive_at_constant_speed_does_not_determine_the_yaw():
     assert off(method, drive) < 3.3
 
 
-def test_imu_configured_without_noise_still_has_noise():
+def test_imu_without_configured_or_visible_noise_is_not_perfect():
     drive, config, leg = made(**SHORT)
     zero = with_settings(config, {f'imu.{name}': 0.0 for name in (
         'gyro_noise', 'gyro_bias', 'gyro_bias_walk', 'accel_noise', 'accel_bias',
@@ -151,9 +151,6 @@ def test_imu_configured_without_noise_still_has_noise():
     method = smooth(leg, zero)
     assert Code.IMU_WORSE_THAN_GRADE in reason_texts(method)
     assert off(method, drive, *BOTH) < 3.3
-
-
-def test_imu_without_signal_at_rest_is_not_treated_as_perfect():
     drive, config, leg = made(**SHORT)
     w_b, f_b = leg.w_b.copy(), leg.f_b.copy()
     for begin, end in leg.standstills:      # as with a dead band, or in a simulator

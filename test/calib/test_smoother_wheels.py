@@ -27,13 +27,11 @@ SCALE = Estimate(0.02, 2e-6, 'm/pulse')
 
 @cached
 def result_of(given=0.0, **options):
-    """Return a drive and the result of the smoother."""
     made = drive(**TOWN | options)
     return made, smoothed(made, odometer__track_width=given)
 
 
 def smoothed(made, leg=None, **more):
-    """Return the result of the smoother for a drive, or for its leg when changed."""
     config = settings(made, method='smoother', **more)
     return calibrate(leg or made.leg(), config).methods['smoother']
 
@@ -195,7 +193,7 @@ def leg_of(wheels):
     return MethodResult('smoother', (), {}, details=wheel_result.wheel_details(wheels))
 
 
-def test_several_legs_are_averaged_by_variance():
+def test_several_legs_are_averaged_by_variance_and_widened_if_they_differ():
     one, other = pair(delta=2e-3, sigma=1e-5), pair(delta=2.01e-3, sigma=2e-5, width=1.601)
     left, right = wheel_result.combine_wheels([leg_of(one), leg_of({}), leg_of(other)]).values()
     weight = np.array([4.0, 1.0]) / 5
@@ -204,9 +202,6 @@ def test_several_legs_are_averaged_by_variance():
     assert left.ratio_sigma == pytest.approx(1e-5 / np.sqrt(1.25))
     assert left.y - right.y == pytest.approx(1.6005)
     assert wheel_result.combine_wheels([leg_of({}), leg_of({})]) == {}
-
-
-def test_legs_that_differ_widen_the_sigma():
     legs = [leg_of(pair(delta=delta, sigma=1e-5)) for delta in (1e-3, 2e-3, 3e-3)]
     left, _ = wheel_result.combine_wheels(legs).values()
     # 0.1 % apart beside 10 ppm: their scatter dominates

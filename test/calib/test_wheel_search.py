@@ -184,7 +184,7 @@ def balanced(array):
                for a, b in combinations(range(array.shape[1]), 2))
 
 
-def test_prime_powers_are_distinguished_from_other_numbers():
+def test_arrays_exist_for_prime_powers_only():
     assert [q for q in range(18) if parameter_sets.prime_power(q)] == [*PRIME_POWERS, 17]
     assert parameter_sets.prime_power(49) == (7, 2)
     assert parameter_sets.prime_power(64) == (2, 6)
@@ -192,6 +192,12 @@ def test_prime_powers_are_distinguished_from_other_numbers():
     assert [parameter_sets.next_prime_power(n) for n in (1, 6, 10, 14, 18)] == [2, 7, 11, 16, 19]
     assert [parameter_sets.next_prime_power(n, odd=True) for n in (3, 4, 8, 14, 26, 50)] == [
         3, 5, 9, 17, 27, 53]
+    with pytest.raises(BadUsage, match='6 levels'):
+        parameter_sets.bose(6, 3)
+    with pytest.raises(BadUsage, match='5 columns'):
+        parameter_sets.bose(3, 5)
+    with pytest.raises(BadUsage, match='0 levels'):
+        parameter_sets.design_for(0)
 
 
 # therefore the tables are those of a field, and the polynomial is irreducible
@@ -205,15 +211,6 @@ def test_every_array_is_balanced(q):
     assert not balanced(array)
     # three of each level in each column: L9(3^4) of figure 2 of the patent, in another order
     assert all((np.bincount(column) == q).all() for column in parameter_sets.bose(q, q + 1).T)
-
-
-def test_arrays_that_do_not_exist_are_refused():
-    with pytest.raises(BadUsage, match='6 levels'):
-        parameter_sets.bose(6, 3)
-    with pytest.raises(BadUsage, match='5 columns'):
-        parameter_sets.bose(3, 5)
-    with pytest.raises(BadUsage, match='0 levels'):
-        parameter_sets.design_for(0)
 
 
 @pytest.mark.parametrize(('levels', 'rows'), [(1, 1), (2, 8), (3, 9), (4, 16), (7, 49), (9, 81)])

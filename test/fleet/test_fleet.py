@@ -38,7 +38,6 @@ def stored(output):
 
 
 def table_of(output, name='vehicles'):
-    """Return a table of an output folder."""
     import pandas as pd
     return pd.read_parquet(output / f'{name}.parquet')
 

@@ -115,11 +115,8 @@ def test_remaining_distance_follows_from_sigma_over_root_of_path(leg):
     assert found.scale.remaining_m == pytest.approx(8 * result.distance, rel=1e-6)
 
 
-def test_there_is_no_forecast_before_the_first_motion(leg):
+def test_no_forecast_is_made_before_the_first_motion_or_if_not_needed(leg):
     with pytest.raises(BadData, match='positions while the wheels have data'):
         forecast(leg, 0.0)
-
-
-def test_an_update_that_is_not_needed_is_abandoned(leg):
     with pytest.raises(Abandoned):
         forecast(leg, 1e9, lambda: False)

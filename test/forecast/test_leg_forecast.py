@@ -158,7 +158,6 @@ def two():
 
 
 def smoother_forecast_at(made, t_stop, **settings):
-    """Return the forecast after so many seconds of a drive."""
     config = with_settings(Config(), {'imu.grade': made.options.imu_grade} | settings)
     return forecast_at(made, config, t_stop, smoother=SmootherSoFar())
 
@@ -246,13 +245,10 @@ def test_the_hint_states_which_values_are_ok_and_what_is_missing(forecast, still
     assert hint_text(forecast, still_s=still_s) == text
 
 
-def test_the_hint_states_the_minimum_leg_first():
+def test_the_hint_states_the_minimum_leg_first_and_then_the_remaining_distance():
     assert hint_text(Forecast(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
         'drive 40 m more, faster than leg.min_speed, 2.78 m/s (10 km/h); then drive on, with '
         'stops and left and right turns, until this hint shows OK for scale and yaw')
-
-
-def test_the_distance_decreases_between_updates():
     forecast = Forecast(MORE, YAW, distance_m=300.0)
     assert 'drive 140 m more' in hint_text(forecast, distance_m=400.0)
     assert 'drive on to reach the limit of 1000 ppm' in hint_text(forecast, distance_m=600.0)

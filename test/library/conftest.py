@@ -17,5 +17,4 @@ def town(tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def calibration(town):
-    """Return the calibration of that drive with the settings next to its bag."""
     return calibrate_bag(town[1], config=town[1].parent / 'calibrator.yaml')

@@ -102,7 +102,7 @@ def of(found, sensor, component):
     return {name: column[rows] for name, column in found.items()}
 
 
-def test_residuals_of_the_track_agree_with_the_result(calibration):
+def test_residuals_of_the_track_agree_with_the_result_also_without_a_fit(calibration, town):
     found, check = calibration.residuals(), calibration.to_dict()['check']
     for name, sensor in (('after', 'track'), ('before', 'track_before')):
         along, left = (of(found, sensor, component) for component in ('along', 'left'))
@@ -110,6 +110,8 @@ def test_residuals_of_the_track_agree_with_the_result(calibration):
         assert np.sqrt((off**2).mean()) == pytest.approx(check[name]['rms'], rel=0.02)
         assert len(off) == calibration.result.legs[0].evidence.fixes
         assert np.all(np.diff(along['distance_m']) >= 0)
+    found = calibrate_bag(town[1], config={'method': 'two_point'}, legs='0:').residuals()
+    assert set(found['sensor']) == {'track', 'track_before'}
 
 
 def test_residuals_of_each_sensor_have_stamp_sigma_and_unit(calibration):
@@ -132,11 +134,6 @@ def test_residuals_of_each_sensor_have_stamp_sigma_and_unit(calibration):
     np.testing.assert_array_equal(one['stamp_ns'], calibration.states()['stamp_ns'][1:])
 
 
-def test_residuals_of_a_method_without_a_fit_are_of_the_track_only(town):
-    found = calibrate_bag(town[1], config={'method': 'two_point'}, legs='0:').residuals()
-    assert set(found['sensor']) == {'track', 'track_before'}
-
-
 def test_fixes_that_end_in_the_middle_of_a_bag_are_stated(tmp_path):
     simulate('town', tmp_path / 'half', duration=200.0, imu_rate=50.0, odometer_rate=20.0,
              outages=((100.0, 300.0),))
@@ -149,15 +146,12 @@ def test_fixes_that_end_in_the_middle_of_a_bag_are_stated(tmp_path):
                 if 'before the last topic' in r.text]
 
 
-def test_a_table_has_a_row_for_each_value(calibration):
+def test_a_table_has_a_row_for_each_value_and_an_error_without_pandas(calibration, monkeypatch):
     pytest.importorskip('pandas', reason='no pandas here: pip install pandas pyarrow')
     table = calibration.to_frame()
     assert table['value'].dropna().to_dict() == {
         name: value for name, value in calibration.values.items() if value is not None}
     assert table.loc['scale_factor', 'unit'] == 'm/pulse'
-
-
-def test_without_pandas_the_error_states_how_to_install_it(calibration, monkeypatch):
     monkeypatch.setitem(sys.modules, 'pandas', None)
     with pytest.raises(OdocalError, match=r'pip install pandas pyarrow'):
         calibration.to_frame()

@@ -55,7 +55,6 @@ class NodeProcess:
         return self.wait()
 
     def wait(self) -> int:
-        """Wait for the end of the process and return the exit code."""
         try:
             code = self.process.wait(PATIENCE)
         finally:
@@ -77,7 +76,6 @@ def wait_for(condition, what: str, patience: float = PATIENCE):
 
 
 def given(settings: dict[str, object]) -> list[str]:
-    """Return settings as ROS arguments."""
     return [x for name, value in settings.items() for x in (
         '-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
 

@@ -61,7 +61,6 @@ def straight(**more):
 
 
 def moved(samples, by_ns: int):
-    """Return samples with other stamps, without a delay."""
     stamps = samples.stamp_ns + by_ns
     return replace(samples, stamp_ns=stamps, received_ns=stamps)
 

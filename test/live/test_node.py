@@ -110,7 +110,6 @@ def _undone(seen, client):
 
 @pytest.fixture(scope='module')
 def written(session):
-    """Return the result that was saved after the first leg."""
     return json.loads((Path(session.saved['saved']) / 'calibration.json').read_text())
 
 

@@ -141,7 +141,6 @@ def test_an_unusable_automatic_leg_does_not_change_the_result():
 
 @pytest.fixture(scope='module')
 def town():
-    """Return the result of a drive through a town, and its configuration."""
     made = drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
     return calibrate(made.leg(), settings(made, method='auto')), settings(made)
 

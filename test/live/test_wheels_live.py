@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs with two wheels, without an IMU, with skid steering and with four wheels."""
+"""Legs with two wheels, without an IMU, and with four wheels."""
 
 import re
 from types import SimpleNamespace
@@ -14,7 +14,6 @@ import pytest
 from odocal_ros.bagio import encode
 from odocal_ros.live.answers import TURNS
 from odocal_ros.sim.scenarios import SimOptions, simulate
-from odocal_ros.sim.wheels import effective_width
 
 INDOOR = {'scenario': 'indoor', 'odometer': 'angle', 'odometer_rate': 25.0, 'reference': 'mocap',
           'fix_rate': 10.0, 'slip_walk': 5e-4, 'seed': 3}
@@ -26,23 +25,12 @@ def joints(drive, **more):
 
 
 def indoor(drive):
-    topics = {'odometer': joints(drive),
-              'fix': encode.pose('mocap', drive.fix, drive.positions())}
-    return topics if drive.options.imu else topics | {'imu': None}
+    return {'odometer': joints(drive), 'imu': None,
+            'fix': encode.pose('mocap', drive.fix, drive.positions())}
 
 
 def sides(drive):
     return {'odometer.left': drive.joints[0], 'odometer.right': drive.joints[1]}
-
-
-@pytest.fixture(scope='module')
-def skid(tmp_path_factory):
-    """Drive 90 s with a robot whose two wheels slide in turns."""
-    return leg_of(
-        tmp_path_factory.mktemp('skid'),
-        INDOOR | {'duration': 90.0, 'imu_rate': 50.0, 'drive': 'skid'}, indoor,
-        lambda drive: {'odometer.drive': 'skid'} | sides(drive), rest_s=4.0, leg_s=80.0,
-        speed=20.0, names=NAMES)
 
 
 @pytest.fixture(scope='module')
@@ -66,18 +54,11 @@ def four(tmp_path_factory):
         rest_s=30.0, leg_s=160.0)
 
 
-@pytest.mark.parametrize('leg', ['skid', 'bare', 'four'])
+@pytest.mark.parametrize('leg', ['bare', 'four'])
 def test_the_replay_of_a_journal_is_identical(leg, request):
     seen = request.getfixturevalue(leg)
     assert 'no NavSatFix' not in check_replay(seen.live, seen.journal)    # topics are known
     assert 'Traceback' not in seen.node.text
-
-
-def test_skid_steering_gives_the_effective_track_width(skid):
-    width, true = skid.live['result']['track_width'], effective_width(skid.drive.options)
-    assert width['method'] == 'planar'
-    assert within(width, true)
-    assert 4 * width['sigma'] < 0.02 * true
 
 
 def test_a_robot_without_an_imu_is_calibrated_by_its_wheels(bare):

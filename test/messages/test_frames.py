@@ -121,7 +121,6 @@ def test_a_few_messages_of_another_frame_are_dropped(made, tmp_path):
 
 
 def fixes_of(messages, **settings):
-    """Return the fixes of messages of one type."""
     msgtype = messages[0].__msgtype__
     config = with_settings(Config(), {k.replace('__', '.'): v for k, v in settings.items()})
     reader = make_reader('fix', msgtype, config)

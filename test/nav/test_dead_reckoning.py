@@ -58,7 +58,7 @@ def test_conversion_to_the_origin_frame_and_back_is_exact(place):
     assert_allclose(origin.to_geodetic(np.array([0.0, 0.0, 7.0]))[2], place[2] + 7, atol=5e-9)
 
 
-def test_track_is_interpolated_linearly_and_constant_outside():
+def test_track_is_interpolated_linearly_and_constant_outside_also_of_one_epoch():
     track = quarter_turn(4)
     assert_allclose(track.at(track.t), track.P, atol=1e-15)
     assert_allclose(track.at(3.75), (track.P[1] + track.P[2]) / 2, atol=1e-15)
@@ -66,9 +66,6 @@ def test_track_is_interpolated_linearly_and_constant_outside():
     assert track.at(np.zeros((2, 3))).shape == (2, 3, 3, 3)
     assert_allclose(track.C_nb_at(np.array([-5.0, 2.4, 2.6, 99.0])), matrix_from_rpy(
         np.outer(np.deg2rad([0, 22.5, 22.5, 90]), [0, 0, 1])), atol=1e-15)
-
-
-def test_track_of_one_epoch_is_at_the_origin_at_any_time():
     track = dead_reckon(np.array([3.0]), np.array([[0, 0, 0, 1.0]]),
                         Travel(np.array([0.0, 9.0]), np.array([0.0, 1.0]), 0.0))
     assert isinstance(track, Track)

@@ -20,14 +20,11 @@ from odocal_ros.settings.config import ProjectionConfig
 pytest.importorskip('pyproj')
 
 
-def test_on_the_central_meridian_northing_is_the_meridian_arc():
+def test_on_the_central_meridian_northing_is_the_arc_and_the_scale_0_9996():
     """A quarter of the meridian: 10 001 965.729 m (WGS 84), eq. (1) with m = 0."""
     north, east = Plane(9.0).forward(np.pi / 2, np.deg2rad(9.0))
     assert north == pytest.approx(10_001_965.729, abs=5e-4)
     assert east == pytest.approx(500_000.0, abs=1e-6)
-
-
-def test_utm_scale_on_the_central_meridian_is_0_9996():
     start, end = np.array([0.7, np.deg2rad(9.0), 0.0]), np.array([0.7001, np.deg2rad(9.0), 0.0])
     plane = plane_for(ProjectionConfig(kind='utm'), np.deg2rad(9.3))
     assert plane_chord(plane, start, end)[0] / geodesic_chord(start, end)[0] == pytest.approx(

@@ -170,12 +170,9 @@ def test_a_stop_is_found_with_one_pulse_per_wheel_turn(scale):
     assert 0 <= spans[0, 1] < np.sqrt(4 * scale / 0.48)
 
 
-def test_median_factors_are_those_of_the_distributions():
+def test_robust_levels_have_the_factors_of_the_distributions():
     assert pytest.approx(norm.ppf(0.75), abs=1e-4) == NORMAL_MEDIAN
     assert pytest.approx(rayleigh.median(), abs=1e-4) == RAYLEIGH_MEDIAN
-
-
-def test_ten_per_cent_outliers_change_the_level_little():
     x = np.random.default_rng(1).normal(0.0, 0.3, 30_000)
     # of 30,000 values a median is known to 0.8 %: three sigmas
     assert robust_sigma(x) == pytest.approx(0.3, rel=0.024)

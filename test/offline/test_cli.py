@@ -185,7 +185,7 @@ def run(quiet=False):
     return out, shown.decode()
 
 
-def test_a_terminal_shows_each_phase_and_the_line_is_erased():
+def test_a_terminal_shows_each_phase_and_erases_it_and_a_pipe_shows_none():
     out, shown = run()
     assert out == 'the result\n'
     for part in ('reading town', '25 %', 'leg 2 of 2', '50 %', 'drawing the report'):
@@ -194,9 +194,6 @@ def test_a_terminal_shows_each_phase_and_the_line_is_erased():
     assert '%' not in last
     assert shown.split('\r')[-1].strip() == ''      # the line is erased
     assert '\n' not in shown.replace('\r\n', '')
-
-
-def test_quiet_and_pipes_show_no_progress():
     assert run(quiet=True)[1].count('reading') == 0
     # nothing is written if stderr is a file or a pipe
     done = subprocess.run([sys.executable, '-c', CODE.format(quiet=False)], text=True,

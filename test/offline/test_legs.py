@@ -83,7 +83,6 @@ def test_marks_of_each_run_are_found_and_cancelled_legs_are_not():
 
 
 def recorded(drive):
-    """Return a recorder fed with a drive, and a bag of its time span."""
     recorder = LegRecorder()
     for slot in ('imu', 'odometer', 'odometer_right', 'fix', 'heading'):
         recorder.feed(slot, getattr(drive, slot))

@@ -7,7 +7,6 @@ from dataclasses import replace
 import json
 import math
 import os
-from pathlib import Path
 import subprocess
 import sys
 
@@ -111,28 +110,6 @@ def test_replay_of_a_bag_equals_the_pipeline_on_the_samples(drive, bag, tmp_path
         assert printed['result'][name]['sigma'] == estimate.sigma
 
 
-def test_several_bags_are_legs_of_one_vehicle(tmp_path, capsys):
-    paths, ratio = [], None
-    for seed in (1, 2, 3):
-        drive = simulate(SimOptions(scenario='straight', duration=240.0, imu_grade='tactical',
-                                    seed=seed, start_ns=seed * 10**12, **LOW))
-        ratio = drive.truth.scale_ratio
-        paths.append(write_bag(tmp_path / f'drive{seed}', drive_topics(drive)))
-    common = ['--set', f'odometer.nominal_scale={drive.options.nominal_scale!r}', '--set',
-              'imu.grade=tactical', '--json']
-    assert replay(*paths, *common, *QUICK, '--output', tmp_path / 'all') == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert [Path(leg['bag']).stem for leg in printed['legs']] == ['drive1', 'drive2', 'drive3']
-    assert len({entry['sha256'] for entry in printed['inputs']}) == 3
-    assert 'LEGS_DISAGREE' not in {r['code'] for r in printed['reasons']}
-    whole = printed['result']['scale_ratio']
-    single = [leg['methods']['two_point']['estimates']['scale_ratio']['sigma']
-              for leg in printed['legs']]
-    assert abs(whole['value'] - ratio) < 4 * whole['sigma']
-    # own errors average down: between the best of three alone and a third of it
-    assert min(single) / 3 < whole['sigma'] < min(single)
-
-
 def test_holdout_checks_the_part_that_is_not_fitted(drive, bag, tmp_path, capsys):
     assert replay(bag, *known(drive), '--holdout', '--json', '--output', tmp_path / 'out') == 0
     printed = json.loads(capsys.readouterr().out)
@@ -165,21 +142,6 @@ def test_set_takes_precedence_over_the_config_file(bag, tmp_path, capsys):
     assert printed['config']['leg.min_distance'] == 9000.0
     assert replay(bag, *QUICK, '--config', config, '--set', 'leg.min_distance=200', '--output',
                   tmp_path / 'b', '--quiet') == 0
-
-
-@pytest.mark.parametrize(('argv', 'words'), [
-    (['--set', 'leg.min_distanse=3'], 'leg.min_distance'),
-    (['--config', '/nowhere.yaml'], '/nowhere.yaml'),
-    (['--leg', '900000:900001'], 'runs from 0'),
-    (['--imu-topic', '/other'], '/other'),
-    (['--set', 'method=best'], 'method')])
-def test_wrong_options_give_one_line_and_exit_code_2(argv, words, bag, tmp_path, capsys):
-    assert replay(bag, '--output', tmp_path / 'out', *argv) == 2
-    first, *listed = capsys.readouterr().err.splitlines()
-    assert words in first
-    assert all(line.startswith('  /') for line in listed)
-    assert bool(listed) == ('/other' in argv)
-    assert not (tmp_path / 'out').exists()
 
 
 # real drives ------------------------------------------------------------------------------------

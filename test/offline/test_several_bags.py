@@ -26,7 +26,6 @@ SHORT = {'scenario': 'straight', 'duration': 220.0, 'imu_rate': 50.0, 'odometer_
 
 @pytest.fixture(scope='module')
 def bags(tmp_path_factory):
-    """Return a folder of bags, each of another day."""
     folder = tmp_path_factory.mktemp('several')
     for day, (name, more) in enumerate({
             'one': {}, 'other': {'scale': 0.03}, 'speed': {'odometer': 'speed'},

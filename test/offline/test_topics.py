@@ -39,12 +39,17 @@ def choose(found, overrides=None, **settings):
     return choose_topics(found, config, overrides or {})
 
 
-def test_one_topic_of_each_type_is_used():
+def test_one_topic_of_each_type_is_used_also_in_a_namespace():
     expected = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
     assert choose(topics()) == expected
     assert choose(topics() | {n: TopicInfo(n, t, 5) for n, t in ODD.items()}) == expected
     # a topic without messages is not a candidate
     assert choose(topics() | {'/imu/raw': TopicInfo('/imu/raw', IMU, 0)}) == expected
+    found = {n: TopicInfo(n, t, 9) for n, t in {
+        '/car/imu/data': IMU, '/car/odometer': INT, '/car/fix': FIX,
+        '/car/calibrator/status': 'diagnostic_msgs/msg/DiagnosticArray'}.items()}
+    assert choose(found) == {'odometer': '/car/odometer', 'imu': '/car/imu/data',
+                             'fix': '/car/fix'}
 
 
 @pytest.mark.parametrize(('found', 'overrides', 'settings', 'match'), [
@@ -145,14 +150,6 @@ def test_the_heading_topic_is_chosen_by_its_name():
     found = topics(gnss__heading_imu=IMU)
     assert choose(found, **BY_TOPIC)['heading'] == '/gnss/heading_imu'
     assert choose(topics(other=IMU), {'heading': 'other'})['imu'] == '/imu/data'
-
-
-def test_the_topics_of_a_namespaced_node_are_found():
-    found = {n: TopicInfo(n, t, 9) for n, t in {
-        '/car/imu/data': IMU, '/car/odometer': INT, '/car/fix': FIX,
-        '/car/calibrator/status': 'diagnostic_msgs/msg/DiagnosticArray'}.items()}
-    assert choose(found) == {'odometer': '/car/odometer', 'imu': '/car/imu/data',
-                             'fix': '/car/fix'}
 
 
 @pytest.mark.parametrize('kind', [

@@ -84,7 +84,6 @@ def smoothed(good):
 
 @pytest.fixture
 def nothing():
-    """Return a rejected calibration without any value."""
     reason = Reason(Code.NO_FIX, 'no fix came')
     leg = LegResult(0, 10 * 10**9, 0.0, 10.0, 5, 5, 0, 0, (reason,), {})
     return Calibration((reason,), {}, {}, (leg,))
@@ -92,5 +91,4 @@ def nothing():
 
 @pytest.fixture
 def rejected(good):
-    """Return a calibration that has all values and is rejected."""
     return replace(good, reasons=(*good.reasons, Reason(Code.GYRO_SIGN, 'gyro z is reversed')))

@@ -107,12 +107,13 @@ def test_the_radius_follows_from_the_scale_factor(good, unit, settings, radius):
             assert found[name] == pytest.approx(dict.fromkeys(keys, radius))
 
 
-def test_undetermined_values_are_not_written(good):
+def test_undetermined_values_and_noise_are_not_written(good):
     lost = {n: Estimate(None, None, 'm/pulse') for n in ('scale_factor', 'scale_ratio')}
     written = texts(with_estimates(good, **lost))
     assert {'wheel_input.txt', 'ros2_controllers.yaml'}.isdisjoint(written)
     by_angle = with_estimates(good, scale_factor=Estimate(0.05, 1e-6, 'm/rad'))
     assert 'wheel_input.txt' not in texts(by_angle)
+    assert not {TWIST, IMU} & texts(good).keys()
 
 
 def blocks(text):
@@ -173,10 +174,6 @@ def test_one_wheel_gives_no_turn_rate_and_estimators_get_a_density(smoothed):
     density = float(re.search(rf'{foreign_keys.WHEEL_INERTIAL}: (\S+)', text)[1])
     x = blocks(text)['diff_drive_controller'][foreign_keys.TWIST_COVARIANCE][0]
     assert density == pytest.approx(np.sqrt(x * 0.1), rel=0.01)
-
-
-def test_two_point_results_have_no_noise_files(good):
-    assert not {TWIST, IMU} & texts(good).keys()
 
 
 def test_only_imu_errors_that_the_drive_determined_are_written(smoothed):

@@ -38,7 +38,6 @@ def held(place):
 
 @pytest.fixture
 def refuse(monkeypatch):
-    """Return a function that makes the n-th disk operation fail."""
     def at(step, code=errno.ENOSPC):
         return Refusing(step, code).put_in(monkeypatch)
     return at

@@ -54,7 +54,7 @@ def test_the_structure_conforms_to_rfc_7946(driven):
         assert feature['properties']['leg'] == 1
 
 
-def test_longitude_comes_first_and_positions_agree_with_the_track(driven):
+def test_longitude_comes_first_and_positions_and_marks_agree_with_the_track(driven):
     from pyproj import Geod
     line = np.array(of_kind(driven, 'corrected')[0]['geometry']['coordinates'])
     assert line[0].tolist() == [8.0, 50.0, 200.0]
@@ -64,9 +64,6 @@ def test_longitude_comes_first_and_positions_agree_with_the_track(driven):
     back = Origin(*driven.legs[0].origin).to_n(np.column_stack(
         [np.deg2rad(line[:, 1::-1]), line[:, 2]]))
     assert np.abs(back - driven.legs[0].track_n).max() < 2e-3
-
-
-def test_the_marks_are_the_ends_of_the_track(driven):
     start, stop = of_kind(driven, 'mark')
     line = of_kind(driven, 'corrected')[0]['geometry']['coordinates']
     assert start['geometry']['coordinates'] == line[0]

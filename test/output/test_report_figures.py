@@ -55,7 +55,7 @@ def test_the_newest_of_many_legs_are_shown_side_by_side(good, monkeypatch):
     assert [f'leg {k}, two' in drawing for k in (1, 2, 3)] == [False, True, True]
 
 
-def test_the_scale_against_speed_is_drawn_with_its_fit(good):
+def test_the_scale_is_drawn_against_speed_and_window_length(good):
     bins = np.array([[5.0, 1.01, 1e-3, 12], [15.0, 0.99, 1e-3, 12]])
     found = SpeedScale(bins, (0.98, 1e-3), (0.14, 0.02), (-0.35, 0.03))
     with apply_style():
@@ -65,9 +65,6 @@ def test_the_scale_against_speed_is_drawn_with_its_fit(good):
     assert drawn.startswith('<svg')
     with apply_style():
         assert 'No fit: the speed varies too little' in by_speed(SpeedScale(bins), 'leg1')[1]
-
-
-def test_the_scale_against_the_length_of_the_window_is_drawn():
     found = np.array([[2.0, 4e-3, 1e-3, 300], [20.0, 1e-3, 1e-3, 30], [200.0, 0.0, 1e-3, 12]])
     with apply_style():
         title, says, drawn = by_window(found, 'leg1')

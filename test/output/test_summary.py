@@ -69,12 +69,17 @@ def test_numbers_have_the_required_digits_signs_and_units():
     assert deviation_text(1.1, None) == '+10 %'
 
 
-def test_a_line_break_does_not_separate_a_number_from_its_unit():
+def test_lines_fit_a_narrow_terminal_and_keep_numbers_with_their_units(good):
     text = 'uncertainty is 21 %, too large; the limit is 5 %, after 16.5 m, ± 0.2 m/s at t = 7 s'
     for width in range(12, 60):
         lines = wrapped(text, width=width)
         assert not any(line.lstrip()[0] in '%m0=7' for line in lines), width
         assert ' '.join(line.strip() for line in lines) == text
+    text = screen(whole(good), width=80)
+    assert max(len(line) for line in text.splitlines()) <= 80
+    for part in ('0.0500000 ± 0.0000012 m/pulse', '-1.0000 ± 0.0029 deg', 'wheels', 'WHEEL_SLIP',
+                 'error budget', 'TOPIC_GAP: a gap of 3 s', '08:53:20', 'heading error'):
+        assert part in text, part
 
 
 def test_the_screen_shows_all_values_in_fewer_than_30_lines(good):
@@ -187,14 +192,6 @@ def whole(good):
                        'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels')})
 
 
-def test_lines_fit_a_narrow_terminal(good):
-    text = screen(whole(good), width=80)
-    assert max(len(line) for line in text.splitlines()) <= 80
-    for part in ('0.0500000 ± 0.0000012 m/pulse', '-1.0000 ± 0.0029 deg', 'wheels', 'WHEEL_SLIP',
-                 'error budget', 'TOPIC_GAP: a gap of 3 s', '08:53:20', 'heading error'):
-        assert part in text, part
-
-
 def test_a_terminal_with_few_rows_omits_details_that_the_report_has(good):
     full = screen(whole(good), width=80).splitlines()
     fits = {rows: screen(whole(good), width=80, rows=rows) for rows in (99, len(full) - 1, 30)}
@@ -256,17 +253,14 @@ def test_a_gyro_scale_far_from_1_is_shown(good, error, sigma, shown):
     assert (shown in text) if shown else ('gyro scale' not in text)
 
 
-def test_the_path_ratio_is_shown_with_the_scale(good):
+def test_the_path_ratio_is_compared_with_the_scale_or_the_factor_as_sent(good):
     assert 'path ratio' not in screen(good)
     legs = tuple(replace(good.legs[0], path_ratio=ratio, distance=distance)
                  for ratio, distance in ((0.0505, 1000.0), (0.0508, 2000.0)))
     line = next(x for x in screen(replace(good, legs=legs)).splitlines() if 'path ratio' in x)
     assert line.split()[2:4] == ['0.05070', 'm/pulse']
     assert line.endswith('fixes / odometer, +1.4 % from the scale factor')
-
-
-def test_the_path_ratio_of_a_truncated_speed_is_compared_with_the_factor_as_sent(good):
-    """The path ratio of whole km/h is 0.9947, the factor as sent, 0.8 % above the exact one."""
+    # the path ratio of whole km/h is 0.9947, the factor as sent, 0.8 % above the exact one
     estimates = {'scale_factor': Estimate(0.9867, 3e-4, '1'),
                  'scale_factor_as_sent': Estimate(0.9947, 3e-4, '1')}
     text = screen(replace(good, estimates=good.estimates | estimates,

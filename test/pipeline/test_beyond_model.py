@@ -61,8 +61,13 @@ def test_a_value_far_from_its_setting_is_determined_despite_a_tight_prior():
     assert found.sigma > 0.05 / 2
 
 
-def test_a_delay_of_zero_is_not_reported():
+def test_only_one_method_reports_a_delay_other_than_zero_and_the_configured_one():
     assert delay_texts(drive(**ROUTE), 'smoother') is None
+    made = drive(**ROUTE, fix_delay=0.12)
+    *_, offset = delay_texts(made, 'smoother', gnss__time_offset=0.05)
+    assert delay_texts(made, 'smoother', gnss__time_offset=offset) is None
+    result = calibrate(made.leg(), settings(made, method='all', heading_sigma=None))
+    assert [r.code for r in result.reasons].count(Code.DELAY_SEEN) == 1
 
 
 @pytest.mark.parametrize(('late', 'sigma', 'fix_sigma', 'is_said'), [
@@ -76,14 +81,6 @@ def test_a_delay_is_reported_if_significant_and_with_an_effect(late, sigma, fix_
     run = SimpleNamespace(config=Config(), fix_sigma=fix_sigma, inputs=SimpleNamespace(
         travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0, clock_delays={}))       # 10 m/s
     assert bool(delay_notes(run, {'gnss': (late, sigma)}, scale=0.5)) == is_said
-
-
-def test_a_configured_delay_is_included_and_one_method_reports_the_delay():
-    made = drive(**ROUTE, fix_delay=0.12)
-    *_, offset = delay_texts(made, 'smoother', gnss__time_offset=0.05)
-    assert delay_texts(made, 'smoother', gnss__time_offset=offset) is None
-    result = calibrate(made.leg(), settings(made, method='all', heading_sigma=None))
-    assert [r.code for r in result.reasons].count(Code.DELAY_SEEN) == 1
 
 
 SPUN, SLID = (Reason(Code.WHEEL_SLIP, f'the wheel {what}') for what in ('spun', 'slid'))
@@ -201,16 +198,13 @@ def test_slow_slip_is_reported_with_its_size(slipped):
     assert Code.SCALE_SIGMA_TOO_LARGE not in reason_texts(result)
 
 
-def test_an_increased_sigma_is_compared_with_its_limit():
+def test_a_sigma_increased_by_slip_is_compared_with_its_limit():
     made = drive(**STRAIGHT)
     result = calibrate(slow(made), settings(made, method='smoother',
                                             verdict__max_scale_sigma=1e-3))
     text, = (r.text for r in result.methods['smoother'].reasons
              if r.code is Code.SCALE_SIGMA_TOO_LARGE)
     assert float(text.split()[3]) > 2400           # ppm
-
-
-def test_without_slip_no_sigma_is_increased():
     made = drive(**STRAIGHT)
     result = calibrate(made.leg(), settings(made, method='all'))
     assert not any(s.name == 'slow_wheel_slip' for m in result.methods.values() for s in m.sources)

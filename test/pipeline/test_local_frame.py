@@ -50,7 +50,6 @@ def posed(made, latitude_deg=math.nan, position=None):
 
 
 def without_covariance(made):
-    """Return the leg of a drive whose fixes have no covariance, like poses."""
     return with_columns(made.leg(), 'fix', covariance_type=np.zeros_like)
 
 
@@ -213,14 +212,21 @@ def test_a_pose_that_contains_the_wheels_is_reported():
     assert Code.FIXES_FOLLOW_ODOMETER not in reason_texts(plain)
 
 
-def test_a_result_in_a_local_frame_has_no_map(made):
+def test_a_result_in_a_local_frame_has_no_map_and_no_north(made):
     assert calibrate(made.leg(), settings(made)).origin is not None
     result = calibrate(posed(made), settings(made))
     assert result.origin is None
     assert result.track_n is not None
+    made = drive(**CAR | {'duration': 120.0})
+    config = settings(made, **SMOOTHER)
+    for leg, axes in ((without_covariance(made), ['east of the start', 'north of the start']),
+                      (posed(made), ['x from the start', 'y from the start'])):
+        ax = Figure().subplots()
+        draw_track(ax, calibrate(leg, config).evidence)
+        assert [label.split(',')[0] for label in (ax.get_xlabel(), ax.get_ylabel())] == axes
 
 
-def test_map_coordinates_are_refused_with_a_remedy(made):
+def test_map_coordinates_are_refused_and_far_positions_stated_with_their_distance(made):
     far = posed(made, position=made.positions() + [691_000.0, 5_334_000.0, 0.0])
     assert (far.fix.status == LOCAL_STATUS).all()
     _, found = screen(far, settings(made))
@@ -228,9 +234,6 @@ def test_map_coordinates_are_refused_with_a_remedy(made):
     assert refused[f'all {len(far.fix.stamp_ns)} positions are NaN or more than 20 km from the '
                    'origin of their frame, as map coordinates are'] == \
         'Publish positions in a frame with its origin near the site.'
-
-
-def test_positions_far_from_a_local_origin_are_stated_by_their_distance(made):
     position = made.positions()
     position[70:74] += 30_000.0
     _, found = screen(posed(made, position=position), settings(made))
@@ -249,13 +252,3 @@ def test_the_simulated_frame_starts_at_the_vehicle_and_looks_ahead():
     origin = Origin(made.options.latitude, made.options.longitude, made.options.height)
     turned = position @ matrix_from_rpy([0.0, 0.0, math.pi / 2 - made.options.heading]).T
     np.testing.assert_allclose(turned, origin.to_n(geodetic), atol=1e-9)
-
-
-def test_a_track_in_a_local_frame_has_no_north():
-    made = drive(**CAR | {'duration': 120.0})
-    config = settings(made, **SMOOTHER)
-    for leg, axes in ((without_covariance(made), ['east of the start', 'north of the start']),
-                      (posed(made), ['x from the start', 'y from the start'])):
-        ax = Figure().subplots()
-        draw_track(ax, calibrate(leg, config).evidence)
-        assert [label.split(',')[0] for label in (ax.get_xlabel(), ax.get_ylabel())] == axes

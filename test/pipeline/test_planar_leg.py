@@ -95,7 +95,7 @@ def test_a_run_without_turns_has_a_scale_and_no_width():
     assert 'turns on the spot' in why.remedy
 
 
-def test_one_wheel_without_an_imu_is_refused():
+def test_too_few_wheels_state_what_is_required():
     made, config = driven()
     leg = made.leg()
     found = calibrate(replace(leg, odometer_right=type(leg.odometer)(
@@ -103,9 +103,6 @@ def test_one_wheel_without_an_imu_is_refused():
                                     leg.odometer.value)))), with_settings(config, {
                                         'odometer.left': '', 'odometer.right': ''}))
     assert Code.NO_IMU in {r.code for r in found.reasons}
-
-
-def test_mecanum_with_two_wheels_states_what_is_required():
     made, config = driven()
     found = calibrate(made.leg(), with_settings(config, {'odometer.drive': 'mecanum'}))
     assert found.verdict is Verdict.REJECTED

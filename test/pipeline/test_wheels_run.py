@@ -48,14 +48,11 @@ def test_result_is_from_the_smoother_and_its_track_agrees_with_the_fixes(made, r
     assert result.after.mean < result.after.rms < result.after.max
 
 
-def test_method_wheels_is_an_alias_of_the_smoother(made, result):
+def test_methods_wheels_and_two_point_select_the_smoother_and_the_end_points(made, result):
     again = calibrate(made.leg(), settings(made, method='wheels'))
     assert again.methods['smoother'].estimates == result.methods['smoother'].estimates
     whole = combine([again], settings(made, method='wheels'))
     assert whole.estimates['scale_factor_left'].method == 'smoother'
-
-
-def test_two_point_is_the_only_method_if_configured(made):
     config = settings(made, method='two_point')
     leg = calibrate(made.leg(), config)
     assert set(leg.methods) == {'two_point'}

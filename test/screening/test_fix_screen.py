@@ -171,13 +171,10 @@ def test_wheel_speeds_units_and_axes_are_found(drive):
         assert re.search(r'contradicts the fixes .* a difference of \d+ % \(limit 1\d %\)', text)
 
 
-def test_a_velocity_that_is_not_configured_is_not_reported(drive):
+def test_a_velocity_not_configured_or_at_a_standstill_is_not_reported(drive):
     leg = with_columns(drive.leg(), 'fix_velocity', velocity_n=lambda v: v.fill(9.0))
     _, found = screen(leg, settings(drive, None, gnss__use_velocity=False))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
-
-
-def test_a_standstill_gives_no_reason_about_the_velocity(drive):
     keep = drive.fix.stamp_ns < drive.options.start_ns + 5 * 10**9
     inputs, _ = screen(kept(drive.leg(), 'fix', keep), settings(drive, None))
     assert len(inputs.external['fix_velocity'].t)

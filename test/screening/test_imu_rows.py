@@ -43,15 +43,12 @@ def rng():
     return np.random.default_rng(5)
 
 
-def test_stamps_with_jitter_are_corrected_to_the_regular_interval(rng):
+def test_stamps_with_jitter_or_in_pairs_are_corrected_to_the_regular_interval(rng):
     true = np.arange(SECONDS * RATE) / RATE
     found = even_imu_times(late(true, rng), *signals(true, rng))
     # means over 20 s, of 2000 rows each, with linear interpolation
     assert np.abs(found - true - 4e-3).max() < 5 * JITTER / np.sqrt(2000)
     assert (np.diff(found) > 0).all()
-
-
-def test_rows_stamped_in_pairs_are_corrected_to_the_regular_interval(rng):
     true = np.arange(SECONDS * RATE) / RATE
     pairs = np.repeat(true[1::2], 2) + np.tile([0.0, 1e-6], len(true) // 2)
     found = even_imu_times(pairs, *signals(true, rng))

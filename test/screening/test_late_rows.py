@@ -41,7 +41,6 @@ def since_first(samples):
 
 @pytest.fixture(scope='module')
 def true(made):
-    """Return the inputs of the drive with each row at its sampling time."""
     return screened(made, made.odometer)[0]
 
 
@@ -58,7 +57,6 @@ def of_smoother(made, samples):
 
 @pytest.fixture(scope='module')
 def straight(made):
-    """Return the scale factor from rows at their sampling times."""
     return of_smoother(made, made.odometer)[0].estimates['scale_factor']
 
 
@@ -77,7 +75,7 @@ def test_late_rows_are_moved_to_their_sampling_times(made, true, how_long_s, dra
     assert how_long_s - 0.03 < worst <= how_long_s
 
 
-def test_late_rows_are_not_slip(made, straight):
+def test_late_rows_are_not_slip_and_a_slip_between_them_is_found(made, straight):
     late, _ = delayed_in_bursts(made.odometer)
     method, texts = of_smoother(made, late)
     assert Code.ODOMETER_LATE in texts
@@ -85,6 +83,13 @@ def test_late_rows_are_not_slip(made, straight):
     found = method.estimates['scale_factor']
     assert abs(found.value - straight.value) < 0.1 * straight.sigma
     assert found.sigma == pytest.approx(straight.sigma, rel=0.05)
+    late, _ = delayed_in_bursts(spun(made, made.odometer))
+    method, texts = of_smoother(made, late)
+    assert Code.ODOMETER_LATE in texts
+    assert Code.WHEEL_SLIP in texts
+    largest = method.details['slips'][0]
+    assert largest['metres'] == pytest.approx(SLIP_M, rel=0.25)
+    assert largest['t'] - 1.5 < SLIP_S < largest['t'] + largest['duration'] + 1.5
 
 
 def arrivals(samples, seconds, lost=0.0, seed=3):
@@ -167,14 +172,11 @@ def test_the_interval_is_that_of_the_sender_with_lost_rows(made, share):
     assert late_rows.intervals(t)[0] == pytest.approx(0.02, abs=2e-5)
 
 
-def test_increments_that_arrive_together_are_all_counted(made):
+def test_increments_that_arrive_together_are_all_counted_also_equal_ones(made):
     steps, form = increments(made)
     inputs, found = screened(made, arrivals(steps, 0.05), form=form)
     assert inputs.travel.s[-1] == steps.value[1:].sum()
     assert Code.STAMPS_NOT_RISING not in found
-
-
-def test_equal_increments_that_arrive_together_are_both_counted(made):
     steps, form = increments(made)
     k = int(np.flatnonzero((np.diff(steps.value) == 0) & (steps.value[1:] > 0))[100])
     at_once = (k + 1, steps.stamp_ns[k])
@@ -189,11 +191,20 @@ def test_rows_with_repeated_header_stamps_are_reported(made):
     assert Code.STAMPS_NOT_RISING in found
 
 
-def test_rows_of_a_sender_that_changes_its_rate_keep_their_stamps(made):
+def test_rows_of_a_changed_rate_or_at_irregular_times_keep_their_stamps(made):
     n = len(made.odometer.stamp_ns)
     rows = take(made.odometer, (np.arange(n) > n // 2) | (np.arange(n) % 2 == 0))
     inputs, found = screened(made, rows)
     np.testing.assert_allclose(inputs.travel.t, drives.seconds(made.leg(), rows), atol=1e-3)
+    assert not found
+    # stamps and counts agree: no row is moved to a regular interval
+    even, counts = made.odometer.stamp_ns, made.odometer.value
+    uneven = even + np.round(np.random.default_rng(4).uniform(0.0, 0.0039, len(even)) * 1e9
+                             ).astype(np.int64)
+    taken = replace(made.odometer, stamp_ns=uneven,
+                    value=np.floor(np.interp(uneven, even, counts)).astype(np.int64))
+    inputs, found = screened(made, taken)
+    np.testing.assert_allclose(inputs.travel.t, drives.seconds(made.leg(), taken), atol=1e-9)
     assert not found
 
 
@@ -213,18 +224,6 @@ def test_rows_that_are_early_or_late_are_moved_to_the_mean():
     assert np.abs(late_ns).max() > 1e7
 
 
-def test_rows_sampled_at_irregular_times_keep_their_stamps(made):
-    """Stamps and counts agree: no row is moved to a regular interval."""
-    even, counts = made.odometer.stamp_ns, made.odometer.value
-    uneven = even + np.round(np.random.default_rng(4).uniform(0.0, 0.0039, len(even)) * 1e9
-                             ).astype(np.int64)
-    taken = replace(made.odometer, stamp_ns=uneven,
-                    value=np.floor(np.interp(uneven, even, counts)).astype(np.int64))
-    inputs, found = screened(made, taken)
-    np.testing.assert_allclose(inputs.travel.t, drives.seconds(made.leg(), taken), atol=1e-9)
-    assert not found
-
-
 @pytest.mark.filterwarnings('error')
 def test_rows_that_arrive_together_are_distributed(made):
     t = since_first(made.odometer)
@@ -239,16 +238,6 @@ def test_rows_that_arrive_together_are_distributed(made):
     speed = np.abs(np.gradient(made.odometer.value.astype(float), t)) * made.truth.scale
     off = true - t + (stamps[0] - made.odometer.stamp_ns[0]) * 1e-9
     assert np.abs(off)[held & (speed > 2.0)].max() < 0.003
-
-
-def test_a_slip_between_late_rows_is_found(made):
-    late, _ = delayed_in_bursts(spun(made, made.odometer))
-    method, texts = of_smoother(made, late)
-    assert Code.ODOMETER_LATE in texts
-    assert Code.WHEEL_SLIP in texts
-    largest = method.details['slips'][0]
-    assert largest['metres'] == pytest.approx(SLIP_M, rel=0.25)
-    assert largest['t'] - 1.5 < SLIP_S < largest['t'] + largest['duration'] + 1.5
 
 
 def test_lost_rows_within_a_burst(made, true):

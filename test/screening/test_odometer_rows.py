@@ -20,7 +20,6 @@ pytestmark = pytest.mark.core
 
 @pytest.fixture
 def true(leg):
-    """Return the travel of the counter without faults."""
     return screen_with(leg)[0].travel.s
 
 

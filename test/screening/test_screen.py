@@ -120,15 +120,12 @@ def test_a_height_without_a_variance_keeps_the_horizontal_variances(leg):
     np.testing.assert_allclose(inputs.covariance_n[:, 2, 2], 4 * leg.fix.covariance_n[:, 0, 0])
 
 
-def test_the_limit_of_poor_fixes_rises_with_the_median_of_the_leg(leg):
+def test_poor_fixes_are_excluded_beyond_a_limit_that_rises_with_the_median(leg):
     usual = with_columns(leg, 'fix', covariance_n=(slice(None), np.eye(3) * 16.0))
     poor = with_columns(usual, 'fix', covariance_n=(slice(20, 26), np.eye(3) * 81.0))
     assert screen_with(poor)[1][Code.BAD_ROWS_DROPPED].endswith('6 with sigma above 8 m')
     _, codes = screen_with(poor, gnss__max_sigma=3.0)
     assert codes[Code.FIXES_UNUSABLE].endswith('with sigma above 3 m')
-
-
-def test_poor_fixes_are_excluded_by_a_setting_that_zero_disables(leg):
     poor = with_columns(leg, 'fix', covariance_n=(slice(100, 300), 25 * np.eye(3)))
     inputs, (reason,) = screen(poor, Config())
     assert reason.code is Code.BAD_ROWS_DROPPED
@@ -185,13 +182,10 @@ def test_hard_driving_is_not_a_glitch():
     assert len(inputs.t_imu) == len(t)
 
 
-def test_a_gyro_with_coarse_steps_does_not_hang(town):
+def test_a_gyro_that_hangs_is_a_gap_and_one_with_coarse_steps_is_not(town, leg):
     step = np.radians(0.25)
     coarse = with_columns(town.leg(), 'imu', w_i=lambda w: np.round(w / step) * step + step)
     assert Code.IMU_GAP not in screen_with(coarse)[1]
-
-
-def test_a_gyro_that_hangs_while_the_wheels_roll_is_a_gap(leg):
     def hung(begin, end):
         first, last = np.searchsorted(seconds(leg, leg.imu), [begin, end])
         return screen_with(
