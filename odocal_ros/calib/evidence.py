@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib import scale_variation
 from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.marks import MarkFix, Path
-from odocal_ros.calib.scale_variation import Sections, SpeedScale
+from odocal_ros.calib.scale_variation import NO_WINDOWS, Sections, sections, window_scale
+from odocal_ros.calib.speed_scale import NO_BINS, speed_scale, SpeedScale
 from odocal_ros.data.arrays import Bools, chunks, Complexes, Floats, Ints, map_rows, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.dead_reckoning import Track
@@ -54,9 +54,8 @@ class Evidence:
     excluded: int                      # number of fixes not used, before decimation
     gaps: tuple[tuple[str, float, float], ...] = ()  # of IMU and odometer: which, begin, end
     t_fit: float = np.inf              # later data are held out of the fit
-    by_speed: SpeedScale = SpeedScale(scale_variation.NO_ROWS)  # of the uncorrected odometer
-    # (w, 4) as ``scale_variation.window_scale``
-    by_window: Floats = field(default_factory=lambda: scale_variation.NO_ROWS)
+    by_speed: SpeedScale = SpeedScale(NO_BINS)  # of the uncorrected odometer
+    by_window: Floats = field(default_factory=lambda: NO_WINDOWS)     # (w, 4) ``window_scale``
 
 
 def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools,
@@ -92,12 +91,12 @@ def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept:
         t_fix=t_fix[k], fix_distance=fix_distance[k], fix_n=fix_n[k], fix_sigma=sigma[k],
         fix_status=status[k], residual=_along_and_across(fixed_n - fix_n, forward)[k],
         residual_before=_along_and_across(before(t_fix) - fix_n, forward)[k],
-        sections=scale_variation.sections(fix_distance, fixed_n, fix_n, sigma),
+        sections=sections(fix_distance, fixed_n, fix_n, sigma),
         t_excluded=t_excluded[x], excluded_because=tuple(causes[i] for i in x),
         fixes=len(t_fix), excluded=len(causes), gaps=_gaps(inputs, span, config),
-        t_fit=t_fit, by_speed=scale_variation.speed_scale(
+        t_fit=t_fit, by_speed=speed_scale(
             t_fix, fix_n, fixed_n, fix_distance, inputs.travel),
-        by_window=scale_variation.window_scale(t_fix, fix_n, fixed_n))
+        by_window=window_scale(t_fix, fix_n, fixed_n))
 
 
 def _gaps(inputs: Inputs, span: tuple[float, float],

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.calib.scale_variation import SpeedScale
+from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.series import Series
 from odocal_ros.output.plot_style import apply_style, BLUE, GREY, new_figure, RED, save_figure

@@ -10,7 +10,7 @@ import numpy as np
 
 from odocal_ros.calib.number_text import relative_unit
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.calib.scale_variation import SpeedScale
+from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.data.arrays import Floats
 from odocal_ros.output import plot_style as style
 from odocal_ros.output.summary import DEG

@@ -26,9 +26,9 @@ from odocal_ros.settings.nominal import nominal_scale
 
 
 class UsableRows(NamedTuple):
-    """The usable rows of a topic, unchanged, and their times from the start mark: (n,) s."""
+    """The usable rows of a topic, as sent, and their times from the start mark: (n,) s."""
 
-    sent: Any
+    samples: Any
     t: Floats
 
 

@@ -7,7 +7,7 @@ Screening: from the raw samples of a leg to usable arrays on one time axis, and 
 Times are s since the start mark. Marks are IMU stamps, so time offsets are relative to the IMU's.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, map_rows, median, release_mapped_memory
 from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.samples import FixSamples, ImuSamples, LOCAL_STATUS, VelocitySamples
+from odocal_ros.data.samples import LOCAL_STATUS, VelocitySamples
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
@@ -57,18 +57,25 @@ def screen(leg: Leg, config: Config,
     if check_faults:
         leg, clock_steps = clocks.without_clock_steps(leg)
         reasons += [*clock_steps, *clocks.clock_reasons(leg, config)]
-    rows, row_reasons = _usable_topics(leg, config, check_faults)
+    rows, wheels, row_reasons = _usable_topics(leg, config, check_faults)
     fixes, fix_reasons = _fix_fields(leg, config, rows)
     reasons += row_reasons + fix_reasons
-    inputs = _make_inputs(leg, config, rows, fixes)
-    inputs = replace(inputs, has_accelerometer=not levelled, is_local=bool(local))
-    wheels = rows.wheels      # the mean has the rows of the first one
+    imu, t_imu = rows['imu']
+    C_bi = matrix_from_rpy(config.imu.mounting_rpy)
+    inputs = Inputs(
+        t_stop=(leg.stop_ns - leg.start_ns) * 1e-9, t_imu=t_imu,
+        w_b=_rotated(imu.w_i, config.imu.gyro_scale, C_bi),
+        f_b=_rotated(imu.f_i, config.imu.accel_scale, C_bi),
+        q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
+        scale_unit=leg.form.scale_unit, has_accelerometer=not levelled, is_local=bool(local),
+        **_travel_fields(leg, wheels), **fixes)
+    # the mean has the rows of the first wheel
     for slot, wheel in zip(leg.wheel_slots, (wheels.mean, *wheels.wheels[1:]), strict=False):
         reasons += topic_gap(slot, wheel.t)
     if check_faults:
-        reasons += alternating_imu_reasons(rows.imu.w_i, rows.imu.f_i)
-        reasons += saturation_reasons(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
-        reasons += frozen_gyro_reasons(inputs.t_imu, rows.imu.w_i, wheels.mean, config.leg.max_gap)
+        reasons += alternating_imu_reasons(imu.w_i, imu.f_i)
+        reasons += saturation_reasons(t_imu, imu.w_i, imu.f_i, config.imu)
+        reasons += frozen_gyro_reasons(t_imu, imu.w_i, wheels.mean, config.leg.max_gap)
         # one axle is only tested with an accelerometer
         if len(wheels.wheels) > (1 if inputs.has_accelerometer else len(SIDES)):
             wheels, axle_reasons = usable_axles(
@@ -114,52 +121,40 @@ def _missing(leg: Leg, reasons: list[Reason]) -> list[Reason]:
             if not len(leg.rows(slot).stamp_ns) and code not in known]
 
 
-@dataclass(frozen=True, eq=False)
-class UsableTopics:
-    """Usable rows of each topic, as sent, and their times from the start mark, (n,) s."""
-
-    imu: ImuSamples
-    t_imu: Floats
-    wheels: Wheels
-    fix: FixSamples
-    t_fix: Floats
-    external: dict[str, UsableRows]
-
-
-def _usable_topics(leg: Leg, config: Config,
-                   check_faults: bool) -> tuple[UsableTopics, list[Reason]]:
+def _usable_topics(leg: Leg, config: Config, check_faults: bool,
+                   ) -> tuple[dict[str, UsableRows], Wheels, list[Reason]]:
+    """Return the usable rows of IMU, fixes and external sensors, the wheels, and reasons."""
     offset = clocks.stamp_offsets(config)
 
     def usable(slot: str) -> tuple[UsableRows, list[Reason]]:
-        sent, t, reasons = usable_rows(slot, leg, config, offset[slot])
-        if check_faults and hasattr(sent, 'q_ni'):
-            sent = without_invalid_orientations(sent)
-        return UsableRows(sent, t), reasons
+        samples, t, reasons = usable_rows(slot, leg, config, offset[slot])
+        if check_faults and hasattr(samples, 'q_ni'):
+            samples = without_invalid_orientations(samples)
+        if slot == 'imu':
+            t = even_imu_times(t, samples.w_i, samples.f_i)
+        return UsableRows(samples, t), reasons
 
-    (imu, t_imu), reasons = usable('imu')
-    t_imu = even_imu_times(t_imu, imu.w_i, imu.f_i)
-    external = {}
-    for slot in EXTERNAL_SLOTS:
-        external[slot], external_reasons = usable(slot)
-        reasons += external_reasons
+    rows, reasons = dict[str, UsableRows](), list[Reason]()
+    for slot in ('imu', *EXTERNAL_SLOTS):
+        rows[slot], slot_reasons = usable(slot)
+        reasons += slot_reasons
     release_mapped_memory()
     wheels, wheel_reasons = travel_of_wheels(leg, config, usable)
-    reasons += wheel_reasons
-    reasons += [Reason(Code.ODOMETER_CHOSEN, form.selection_text)
-                for form in (leg.form, leg.form_right) if form and form.selection_text]
-    (fix, t_fix), fix_reasons = usable('fix')
-    return UsableTopics(imu, t_imu, wheels, fix, t_fix, external), reasons + fix_reasons
+    choices = [Reason(Code.ODOMETER_CHOSEN, form.selection_text)
+               for form in (leg.form, leg.form_right) if form and form.selection_text]
+    rows['fix'], fix_reasons = usable('fix')
+    return rows, wheels, [*reasons, *wheel_reasons, *choices, *fix_reasons]
 
 
 def _fix_fields(leg: Leg, config: Config,
-                rows: UsableTopics) -> tuple[dict[str, Any], list[Reason]]:
+                rows: dict[str, UsableRows]) -> tuple[dict[str, Any], list[Reason]]:
     """Return fixes and external sensors as fields of Inputs, and reasons for unused rows."""
-    fix, external, velocity = rows.fix, rows.external, rows.external['fix_velocity']
-    origin = ' of the leg and its pre-roll' if (rows.t_fix < 0).any() else ''
+    (fix, t_received), velocity = rows['fix'], rows['fix_velocity']
+    origin = ' of the leg and its pre-roll' if (t_received < 0).any() else ''
     use, covariance, fix_reasons = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss, origin)
     # gaps of received fixes: a rejected fix is not a gap
-    reasons = [*fix_reasons, *topic_gap('fix', rows.t_fix)]
-    t_fix = rows.t_fix[use]
+    reasons = [*fix_reasons, *topic_gap('fix', t_received)]
+    t_fix = t_received[use]
     # receivers without a height publish 0
     height = fix.height if fix.height.any() or (fix.status == LOCAL_STATUS).any() else np.full(
         len(fix.height), np.nan)
@@ -167,26 +162,16 @@ def _fix_fields(leg: Leg, config: Config,
     rounding, rounding_reasons = rounding_variance(geodetic, covariance[use])
     covariance = covariance[use] + rounding[:, :, None] * np.eye(3)
     reasons += rounding_reasons
+    external = {slot: rows[slot] for slot in EXTERNAL_SLOTS}
     contradiction = velocity_reasons(
-        velocity.t, velocity.sent.velocity_n, t_fix, geodetic, covariance
+        velocity.t, velocity.samples.velocity_n, t_fix, geodetic, covariance
     ) if config.gnss.use_velocity else ()
     reasons += contradiction
     if contradiction:
-        external = external | {'fix_velocity': UsableRows(VelocitySamples.empty(), np.empty(0))}
+        external['fix_velocity'] = UsableRows(VelocitySamples.empty(), np.empty(0))
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
             'rounding_n': rounding, 'external': external,
             'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}, reasons
-
-
-def _make_inputs(leg: Leg, config: Config, rows: UsableTopics, fixes: dict[str, Any]) -> Inputs:
-    imu = rows.imu
-    C_bi = matrix_from_rpy(config.imu.mounting_rpy)
-    return Inputs(
-        t_stop=(leg.stop_ns - leg.start_ns) * 1e-9, t_imu=rows.t_imu,
-        w_b=_rotated(imu.w_i, config.imu.gyro_scale, C_bi),
-        f_b=_rotated(imu.f_i, config.imu.accel_scale, C_bi),
-        q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
-        scale_unit=leg.form.scale_unit, **_travel_fields(leg, rows.wheels), **fixes)
 
 
 def _travel_fields(leg: Leg, wheels: Wheels) -> dict[str, Any]:

@@ -207,32 +207,30 @@ def travel_of_wheels(leg: Leg, config: Config,
     """
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
-    (samples, t), reasons = usable_rows(slots[0])
-    if len(slots) == 1 and len(config.odometer.wheel_keys) > 1 and len(t):
-        reasons.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
-                              'marks: only the left wheel is used'))
-    first, first_uncertain, new_reasons = _corrected_travel(samples, t, leg.form, config, names[0])
-    reasons += new_reasons
-    wheels, uncertain = [first], [first_uncertain]
-    only_first = Wheels((first,), (first_uncertain,))
-    for slot, name in zip(slots[1:], names[1:], strict=True):
+    wheels, uncertain, reasons = list[Travel](), list[tuple[Floats, Floats]](), list[Reason]()
+    for slot, name in zip(slots, names, strict=True):
         form = leg.form_of(slot)
         if _form_text(form) != _form_text(leg.form):
-            return only_first, [*reasons, Reason(
+            reasons.append(Reason(
                 Code.WHEEL_COUNTERS_DIFFER, f'the {name} wheel publishes {_form_text(form)}, the '
                 f'{names[0]} wheel {_form_text(leg.form)}: they cannot be averaged, so only the '
                 f'{names[0]} wheel is used', 'Publish both wheels as one kind of value. If only '
-                'the modulus differs, set odometer.wrap.')]
-        (samples, t), new_reasons = usable_rows(slot)
-        reasons += new_reasons
-        if not len(t):
-            return only_first, [*reasons, Reason(
+                'the modulus differs, set odometer.wrap.'))
+            return Wheels(tuple(wheels[:1]), tuple(uncertain[:1])), reasons
+        (samples, t), row_reasons = usable_rows(slot)
+        reasons += row_reasons
+        if wheels and not len(t):
+            reasons.append(Reason(
                 Code.WHEEL_DEAD, f'the {name} wheel has no usable value between the marks: only '
-                f'the {names[0]} wheel is used')]
-        wheel, wheel_uncertain, new_reasons = _corrected_travel(samples, t, form, config, name)
-        reasons += new_reasons
+                f'the {names[0]} wheel is used'))
+            return Wheels(tuple(wheels[:1]), tuple(uncertain[:1])), reasons
+        if len(slots) == 1 and len(config.odometer.wheel_keys) > 1 and len(t):
+            reasons.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
+                                  'marks: only the left wheel is used'))
+        wheel, uncertain_travel, wheel_reasons = _corrected_travel(samples, t, form, config, name)
         wheels.append(wheel)
-        uncertain.append(wheel_uncertain)
+        uncertain.append(uncertain_travel)
+        reasons += wheel_reasons
     return Wheels(tuple(wheels), tuple(uncertain)), reasons
 
 

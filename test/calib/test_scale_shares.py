@@ -7,7 +7,8 @@ from drives import drive, settings
 import numpy as np
 import pytest
 
-from odocal_ros.calib.scale_variation import speed_scale, window_scale, WINDOWS
+from odocal_ros.calib.scale_variation import window_scale, WINDOWS
+from odocal_ros.calib.speed_scale import speed_scale
 from odocal_ros.calib.track_check import errors_per_distance, worse_check_reasons
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate

@@ -215,8 +215,8 @@ def test_every_array_is_balanced(q):
 
 @pytest.mark.parametrize(('levels', 'rows'), [(1, 1), (2, 8), (3, 9), (4, 16), (7, 49), (9, 81)])
 def test_design_follows_the_levels(levels, rows):
-    design = parameter_sets.design_for(levels)
-    assert design.rows.shape == (rows, 3)
-    assert levels != 9 or design.name == 'L81(9^10)'
-    assert levels == 2 or balanced(design.rows)
-    assert [len(set(column)) for column in design.rows.T.tolist()] == [levels] * 3
+    name, array = parameter_sets.design_for(levels)
+    assert array.shape == (rows, 3)
+    assert levels != 9 or name == 'L81(9^10)'
+    assert levels == 2 or balanced(array)
+    assert [len(set(column)) for column in array.T.tolist()] == [levels] * 3

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from report_pages import evidence, page_of, three_methods
 
-from odocal_ros.calib.scale_variation import SpeedScale
+from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.output import scale_plots
 from odocal_ros.output.plot_style import apply_style
 from odocal_ros.output.plots import _biases, leg_figures

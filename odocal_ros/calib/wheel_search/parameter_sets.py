@@ -33,14 +33,6 @@ NAMES = ('left', 'right', 'heading')
 FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
 
 
-@dataclass(frozen=True, eq=False)
-class Design:
-    """An orthogonal array of level numbers from 0, a row for each set to try."""
-
-    name: str
-    rows: Ints  # (n, columns)
-
-
 def prime_power(q: int) -> tuple[int, int] | None:
     """Return (p, m) with q = p^m, p prime; None if q is not a prime power."""
     p = next((d for d in range(2, math.isqrt(max(q, 0)) + 1) if q % d == 0), q)
@@ -127,17 +119,17 @@ def full_factorial(levels: tuple[int, ...]) -> Ints:
     return np.stack([g.ravel() for g in np.indices(tuple(levels))], -1).astype(np.int64)
 
 
-def design_for(levels: int) -> Design:
+def design_for(levels: int) -> tuple[str, Ints]:
     """
-    Return the array of three parameters with that many levels each.
+    Return name and level numbers, from 0, of the sets of three parameters to try: (n, 3).
 
-    One or two levels: all combinations. More, a prime power: an orthogonal array.
+    levels : of each. One or two: all combinations; more, a prime power: an orthogonal array.
     """
     if levels < 1:
         raise BadUsage(f'{levels} levels: give 1 or more for each parameter')
     if levels < 3:
-        return Design(f'all {levels**3} combinations', full_factorial((levels,) * 3))
-    return Design(f'L{levels**2}({levels}^{levels + 1})', bose(levels, 3))
+        return f'all {levels**3} combinations', full_factorial((levels,) * 3)
+    return f'L{levels**2}({levels}^{levels + 1})', bose(levels, 3)
 
 
 @dataclass(frozen=True, eq=False)

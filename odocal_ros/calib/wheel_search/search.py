@@ -16,7 +16,6 @@ import numpy as np
 
 from odocal_ros.calib.wheel_search.minimisation import least_squares, LeastSquares, refine, Refined
 from odocal_ros.calib.wheel_search.parameter_sets import (
-    Design,
     design_for,
     NAMES,
     parameter_sets,
@@ -39,7 +38,7 @@ class SearchResult:
 
     start: tuple[float, float]  # scales before, m per unit
     ranges: Ranges
-    design: Design
+    array_name: str
     sets: Floats                # of the array's rows
     scores: Scores              # of these sets
     best: int  # row with the least mean distance (robust: loss), of equal ones the least maximum
@@ -68,7 +67,7 @@ class SearchResult:
             shown = np.sort(np.argsort(self.scores.mean, kind='stable')[:MAX_ROWS])
         return {
             'ranges': ranges,
-            'array': {'name': self.design.name, 'rows': len(self.sets),
+            'array': {'name': self.array_name, 'rows': len(self.sets),
                       'imbalance': 0.0,
                       'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
             'best_row': _set(self.sets[self.best]) | self.scores.row(self.best),
@@ -112,8 +111,8 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     """
     if len(leg.t) < 4:
         return None
-    design = design_for(ranges.levels)
-    x = ranges.values(design.rows)
+    array_name, rows = design_for(ranges.levels)
+    x = ranges.values(rows)
     sets = parameter_sets(leg, x)
     scores = score(leg, sets, robust)
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
@@ -127,9 +126,10 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     refined_set, direct_set = (parameter_sets(leg, fit.x)[0] for fit in (refined, direct))
     refined_set[2], direct_set[2] = wrap(refined_set[2]), wrap(direct_set[2])
     return SearchResult(
-        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, fixed_difference,
-        refined, direct, free, refined_set, direct_set, score(leg, leg.start, robust),
-        score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, fixed_difference))
+        (leg.scale_left, leg.scale_right), ranges, array_name, sets, scores, best,
+        fixed_difference, refined, direct, free, refined_set, direct_set,
+        score(leg, leg.start, robust), score(leg, refined_set, robust),
+        _reasons(ranges, refined, direct, free, fixed_difference))
 
 
 def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
