@@ -46,12 +46,7 @@ COMPARED = {
 
 def deciding_methods(method_setting: str | tuple[str, ...],
                      compared: bool = False) -> tuple[str, ...]:
-    """
-    Return the methods that may give the result, the best first.
-
-    method_setting : the setting ``method``, or the methods.   compared : also the methods that are
-    computed only for comparison.
-    """
+    """Return the methods that may give the result, best first; compared: and those to compare."""
     if not isinstance(method_setting, str):
         return method_setting
     if method_setting in ('auto', 'all'):
@@ -87,11 +82,8 @@ def choose(methods: Mapping[str, MethodResult],
 def rejected_method_reasons(methods: Mapping[str, MethodResult], method_setting: str
                             | tuple[str, ...],
                             stated_codes: Iterable[Code] = ()) -> list[Reason]:
-    """
-    Return METHOD_REJECTED for each rejected method that is better than a usable one.
-
-    Not if the cause is one of ``stated_codes``, or missing data, such as of a second wheel.
-    """
+    """Return METHOD_REJECTED of rejected methods better than a usable one, except stated_codes."""
+    # a method without its data, such as of a second wheel, is not reported
     results = [methods[name] for name in deciding_methods(method_setting) if name in methods]
     usable = [i for i, m in enumerate(results) if m.verdict is not Verdict.REJECTED]
     causes = [(m.name, next(r for r in m.reasons if r.code.severity is Verdict.REJECTED))

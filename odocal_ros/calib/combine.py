@@ -82,12 +82,8 @@ def last_leg_values(results: Sequence[MethodResult],
 
 def _combine(parameter: str, i: int, results: Sequence[MethodResult], walk_variance: Floats,
              ) -> tuple[float, float, dict[str, Floats], tuple[Reason, ...]]:
-    """
-    Return the mean of a parameter, its variance by unshared errors, shared effects, and reasons.
-
-    It is row i of the sources; docs/method.md (T15), (T16). ``shared`` has an effect on the mean
-    for each shared source, by name.
-    """
+    """Return mean, unshared variance, shared effects by name, and reasons of parameter i."""
+    # docs/method.md (T15), (T16)
     is_scale = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in results])
     y = np.log(x) if is_scale else x
@@ -132,12 +128,8 @@ def _shared_effects(i: int, results: Sequence[MethodResult]) -> dict[str, Floats
 
 
 def _weights(covariance: Floats) -> Floats:
-    """
-    Return the weights, none below zero, of the mean with the least variance: (J,), (T15).
-
-    covariance : (J, J) with shared errors; without them, a leg that a shared error dominates would
-    make the mean worse.
-    """
+    """Return the weights, none below zero, of the mean with the least variance: (T15)."""
+    # by unshared errors alone, a leg that a shared error dominates would make the mean worse
     from scipy.optimize import nnls
     root = np.linalg.cholesky(covariance / np.trace(covariance))
     weight, _ = nnls(root.T, np.linalg.solve(root, np.ones(len(root))))

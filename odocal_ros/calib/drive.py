@@ -23,11 +23,7 @@ MIN_UNCOUNTED_SHARE = 0.01   # judgement: share of the path without counts that 
 
 def check_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
-    """
-    Return the path length between the marks, m, and reasons of a leg that must be straight.
-
-    Reasons and arguments are those of ``check_path_and_speed``, and LEG_NOT_STRAIGHT.
-    """
+    """Return path length and reasons of ``check_path_and_speed``, and LEG_NOT_STRAIGHT."""
     distance, reasons = check_path_and_speed(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit

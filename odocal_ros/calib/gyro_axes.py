@@ -55,11 +55,7 @@ class WrongAxis(NamedTuple):
 
 
 def level_axes(up: Floats) -> tuple[Floats, list[str]]:
-    """
-    Return level e1, e2 and up as rows, (3, 3), and the name of the sensor axis nearest to each.
-
-    up : (3,) unit vector in the sensor's frame. A name has its sign, such as "-y".
-    """
+    """Return level e1, e2 and up as rows, (3, 3), and the nearest sensor axes, such as "-y"."""
     upright = int(np.argmax(np.abs(up)))
     first, second = (upright + 1) % 3, (upright + 2) % 3
     e1 = np.eye(3)[first] - up[first] * up
@@ -142,11 +138,8 @@ def _inverted_turns(orientation: ImuOrientation, wrong_axes: list[WrongAxis],
 
 def wrong_axes_by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
                          names: list[str]) -> list[WrongAxis]:
-    """
-    Return the level gyro axes that measure the yaw rate instead of the upright axis.
-
-    w_i : (n, 3) rad/s, in the sensor's frame.   axes, names : of ``level_axes``.
-    """
+    """Return the level gyro axes that measure the yaw rate instead of the upright axis."""
+    # w_i : (n, 3) rad/s in i.  axes, names : of ``level_axes``
     def yaw_ratio(axis: Floats) -> float | None:
         """Return the turn ratio of an axis, None if it is not that of the yaw rate."""
         ratio = turn_ratio(inputs.t_imu, map_rows(lambda w: w @ axis, w_i), inputs.t_fix,
@@ -168,11 +161,8 @@ def wrong_axes_by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axe
 
 def wrong_axes_by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats,
                           axes: Floats, names: list[str]) -> list[WrongAxis]:
-    """
-    Return the gyro axes that measure the rotation of gravity about another axis.
-
-    w_i, f_i : (n, 3) rad/s, m/s^2, in the sensor's frame.   axes, names : of ``level_axes``.
-    """
+    """Return the gyro axes that measure the rotation of gravity about another axis."""
+    # w_i, f_i : (n, 3) rad/s, m/s^2, in i.  axes, names : of ``level_axes``
     fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, located.rough_scale)
     if fit is None:
         return []

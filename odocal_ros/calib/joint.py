@@ -108,12 +108,9 @@ class Scatter:
 
 
 def _estimate_scatter(legs: LinkedLegs, usual_scatter: Mapping[str, float]) -> Scatter:
-    """
-    Return the scatter between the legs of the constants in ``usual_scatter``, (S38).
-
-    It is a posterior mean, by restricted likelihood and a half-Cauchy prior with the usual scatter
-    (Gelman 2006), over a fine grid.
-    """
+    """Return the scatter between the legs of the constants in ``usual_scatter``, (S38)."""
+    # posterior mean by restricted likelihood and a half-Cauchy prior of the usual scatter (Gelman
+    # 2006)
     from scipy.interpolate import CubicSpline
     sigmas, likelihood, weights = dict(usual_scatter), dict[str, Floats](), dict[str, Floats]()
     fine_grid = np.linspace(SCATTER_GRID[0], SCATTER_GRID[-1], 301)
@@ -171,11 +168,7 @@ def _find_differing(legs: LinkedLegs, scatter: dict[str, float],
 
 
 def _add_linearisation_errors(legs: LinkedLegs, nonlinear: Sequence[str]) -> Floats:
-    """
-    Add an error to each leg by its distance from the linearisation point; return it: (J,).
-
-    nonlinear : constants with a distance, rad or relative; the error is half its square.
-    """
+    """Add an error to each leg by its distance from the linearisation point; return it: (J,)."""
     linearised, indices = legs.marginals, [legs.names.index(name) for name in nonlinear]
     error = np.zeros(len(linearised))
     for _ in range(3 if nonlinear else 0):     # with reduced weights the estimate changes

@@ -98,9 +98,8 @@ class LinkedLegs:
         self.replace_marginals([_with_names(leg, self.names) for leg in marginals])
         last = self.marginals[-1]
         for name in angles:
-            reference = last.point[self.names.index(name)]
-            self.replace_marginals([leg.with_angle_near(name, reference)
-                                    for leg in self.marginals])
+            angle = last.point[self.names.index(name)]
+            self.replace_marginals([leg.with_angle_near(name, angle) for leg in self.marginals])
         self.prior_mean = last.prior_mean
         self.prior_sigma, self.relaxed_sigma = (
             np.max([getattr(leg, sigma) for leg in self.marginals], axis=0)
@@ -111,11 +110,8 @@ class LinkedLegs:
         self.steps = np.maximum(steps, 1e-7)
 
     def combine_sections(self, same_drive: Sequence[bool]) -> 'LinkedLegs':
-        """
-        Return the drives, with the information of their sections added up.
-
-        same_drive : (J - 1,) True if a leg is of the same drive as the leg before.
-        """
+        """Return the drives, with the information of their sections added up."""
+        # same_drive : (J - 1,) True if a leg is of the same drive as the leg before
         is_new_drive = [not is_same for is_same in same_drive] or [True] * len(self.steps)
         if all(is_new_drive):
             return self
@@ -173,13 +169,10 @@ class LinkedLegs:
 
     def _leg_equations(self, legs: 'LegInformation', scatter: dict[str, float] | None,
                        ) -> tuple[Floats, Floats, float, int]:
-        """
-        Return H, g, the cost at x = 0 and the rank of the information of the legs alone.
-
-        With the scatter eliminated, a leg has the information D - T DA'. Its drifting constant is
-        the sum of the steps from this leg on, so rows and columns of a step are sums over the legs
-        up to it.
-        """
+        """Return H, g, the cost at x = 0 and the rank of the information of the legs alone."""
+        # with the scatter eliminated, a leg has the information D - T DA'. Its drifting constant
+        # is the sum of the steps from this leg on, so rows and columns of a step are sums over the
+        # legs up to it
         J, k = len(legs.D), self.drifting
         common = np.delete(np.arange(len(self.names)), k)
         T, DA, gradient, rank = self._eliminate_scatter(legs, scatter)
@@ -254,11 +247,8 @@ class LinkedLegs:
 
     def _eliminate_scatter(self, legs: 'LegInformation', scatter: dict[str, float] | None
                            ) -> tuple[Floats, Floats, Floats, int]:
-        """
-        Return T and DA of ``eliminate_leg_errors``, the remaining gradient, and the sum of ranks.
-
-        T is zero for legs combined earlier, whose information already includes their scatter.
-        """
+        """Return T, DA of ``eliminate_leg_errors``, remaining gradient, and the sum of ranks."""
+        # T is zero for legs combined earlier: their information already includes their scatter
         indices = [self.names.index(name) for name in scatter or ()]
         sigmas = np.array(list((scatter or {}).values())) / self.unit[indices]
         T, DA, A = eliminate_leg_errors(legs.D, indices, sigmas)

@@ -77,12 +77,9 @@ def _inliers(position_n: Floats, covariance_n: Floats) -> Bools:
 
 def _variance_share(t: Floats, residual: Floats, fix_covariance: Floats, weight: Floats,
                     correlation_time: float) -> float:
-    """
-    Return the variance of the mean over that of a single fix: docs/method.md (T7).
-
-    Without a known correlation time, the scatter and the steps from fix to fix show whether the
-    errors are white, or how large their fast and their slow part are.
-    """
+    """Return the variance of the mean over that of a single fix: docs/method.md (T7)."""
+    # without a known correlation time, scatter and steps from fix to fix show whether errors are
+    # white, or how large their fast and their slow part are
     n = len(t)
     white = float(weight @ weight)          # 1/n for equal weights
     if n == 1 or correlation_time == 0:
@@ -117,11 +114,8 @@ def _mean_variance_share(t: Floats, weight: Floats, tau: float) -> float:
 
 
 def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:
-    """
-    Return the correlation time of the slow part, s, by the structure function at a quarter window.
-
-    z : (n, 2) residuals over stated sigmas.   fast, slow : variances of the two parts of z.
-    """
+    """Return the correlation time of the slow part, s: structure function at a quarter window."""
+    # z : (n, 2) residuals over stated sigmas.  fast, slow : variances of the two parts of z
     lag = max(1, len(t) // 4)
     growth = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast      # slow (1 - correlation)
     decorrelated = np.clip(growth / slow, 0.0, 0.95) if slow > 0 else 0.95

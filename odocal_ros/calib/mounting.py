@@ -125,12 +125,9 @@ def estimate_mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
 
 def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
              metres_per_unit: float) -> tuple[Floats | None, float]:
-    """
-    Return the forward axis (level, unit) and its sigma, rad; None if not observable.
-
-    In the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, with one angle for both
-    accelerations. If it does not fit, turns are inverted, as by a mirrored axis (tested later).
-    """
+    """Return the forward axis (level, unit) and its sigma, rad; None if not observable."""
+    # in the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, one angle for both
+    # accelerations. If it does not fit, turns are inverted, as by a mirrored axis (tested later)
     binned = bin_accelerations(t, w_i, f_i, up_i, travel, metres_per_unit)
     if binned is None:
         return None, np.pi

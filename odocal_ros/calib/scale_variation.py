@@ -98,12 +98,9 @@ def _similarity(source: Complexes, target: Complexes) -> Similarity:
 
 
 def _scale_sigmas(fits: list[Similarity], stated: float) -> list[float]:
-    """
-    Return the sigma of the scale of each fit; stated : sigma of a fix, m.
-
-    Variance and correlation of the errors are those of the first-order process whose residuals
-    have the observed power and correlation.
-    """
+    """Return the sigma of the scale of each fit; stated : sigma of a fix, m."""
+    # variance and correlation of the errors are those of the first-order process whose residuals
+    # have the observed power and correlation
     if not fits:
         return []
     residuals = [fit.residual for fit in fits]

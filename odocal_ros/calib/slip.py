@@ -55,11 +55,8 @@ class Slips(NamedTuple):
 
 
 def count_size(travel: Travel) -> float:
-    """
-    Return the size of a count, scale units; for coarse speeds, that of an equivalent count.
-
-    The largest error of such speeds over a window acts as WINDOW_ROUNDING_COUNTS of these counts.
-    """
+    """Return the size of a count, scale units; for coarse speeds, that of an equivalent count."""
+    # their largest error over a window acts as WINDOW_ROUNDING_COUNTS of these counts
     coarse = travel.coarse
     return travel.quantum if coarse is None else (
         coarse.max_error * SPIN_WINDOW / WINDOW_ROUNDING_COUNTS)
@@ -153,12 +150,8 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
 
 
 def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:
-    """
-    Return time, s, and size, m, of each slip, by windows with an excess beyond the limit.
-
-    middle, excess : (m,) s, m, of windows. Those that contain a slip are one group; the window in
-    the middle of the group contains all of it.
-    """
+    """Return time and size of each slip, by (m,) middles, s, and excess, m, of windows."""
+    # windows that contain a slip are one group; the window in its middle contains all of the slip
     rows = np.flatnonzero(np.abs(excess) > limit)
     groups = np.split(rows, np.flatnonzero(np.diff(middle[rows]) > SPIN_WINDOW / 2) + 1)
     centres = [(group[0] + group[-1]) // 2 for group in groups if len(group)]
@@ -207,12 +200,8 @@ def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
 
 
 def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
-    """
-    Return all slips as one source of error, since wheels spin in one direction.
-
-    f : (3,) scale times forward axis.   gradient : derivative of the parameters by a displacement,
-    m, in n.   t, size : (k,) s, m, of the slips.
-    """
+    """Return all slips, (k,) s, m, as one source of error, since wheels spin in one direction."""
+    # f : scale times forward axis.  gradient : of the parameters by displacement in n
     along_n = track.C_nb_at(t) @ f / np.linalg.norm(f) * np.abs(size)[:, None]
     return Source('wheel_slip', gradient @ along_n.sum(axis=0)[:, None])
 

@@ -186,13 +186,12 @@ def worse_check_reasons(path: Floats, before: Floats, after: Floats,
     for length, count, (was, now) in _squared_errors(path, before, after):
         increase = now - was
         # fewer than three pieces end to end have no known scatter; a tenth more is acceptable
-        if count < 3 or now.mean() < 1.1**2 * was.mean() \
-                or increase.mean() < REMARK_SIGMAS * increase.std() / np.sqrt(count):
-            continue
-        return [Reason(Code.CHECK_WORSE, f'in sections of {length:g} m the calibrated track '
-                       f'deviates {np.sqrt(now.mean()):.2g} m rms from the fixes, the '
-                       + ('track as configured' if configured else 'uncalibrated track')
-                       + f' {np.sqrt(was.mean()):.2g} m')]
+        if count >= 3 and now.mean() >= 1.1**2 * was.mean() \
+                and increase.mean() >= REMARK_SIGMAS * increase.std() / np.sqrt(count):
+            track = 'track as configured' if configured else 'uncalibrated track'
+            return [Reason(Code.CHECK_WORSE, f'in sections of {length:g} m the calibrated track '
+                           f'deviates {np.sqrt(now.mean()):.2g} m rms from the fixes, the {track} '
+                           f'{np.sqrt(was.mean()):.2g} m')]
     return []
 
 
@@ -208,7 +207,7 @@ class Pieces(NamedTuple):
 
 def cut_pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Pieces:
     """
-    Cut the drive into pieces long enough for a direction.
+    Return the drive in pieces long enough for a direction.
 
     track_2d, fixes_2d, t : (n, 2), (n, 2), (n,) at the fixes, any unit, m and s.   sigma : white
     noise of a fix, m.
@@ -293,10 +292,8 @@ def _fixes_stay_behind(pieces: Pieces, run: Ints, forward: Ints) -> bool:
 def reversal_reasons(pieces: Pieces, signed: bool) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH if counts increase while the vehicle drives backwards."""
     is_reversed = find_reversed(pieces)
-    if not is_reversed.any():
-        return ()
     cause = 'the counter does not count down' if signed else 'odometer.signed is false'
     return (Reason(Code.TRACK_MISMATCH, f'in {int(is_reversed.sum())} of {len(is_reversed)} '
                    'sections the track runs opposite to the fixes. Likely cause: the vehicle '
-                   f'reversed and {cause}',
-                   Code.REVERSING_UNSIGNED.remedy),)
+                   f'reversed and {cause}', Code.REVERSING_UNSIGNED.remedy),) \
+        if is_reversed.any() else ()

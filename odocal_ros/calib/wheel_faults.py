@@ -128,12 +128,9 @@ def _without_slips(pair: WheelPair, events: list[Event]) -> WheelPair:
 
 def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
                  width: float) -> tuple[list[Event], list[Event]]:
-    """
-    Return the steps of the residual, (n,) m: finished ones, and ones that may change the ratio.
-
-    quantum_m : size of a count, m.   width : track width, m. A step is found as a jump between two
-    means of the residual, for several distances of these, that is larger than by chance.
-    """
+    """Return the steps of the residual, (n,) m, that end, and those that may change the ratio."""
+    # a step is a jump between two means of the residual, at several distances of these, that is
+    # larger than by chance. quantum_m, width : size of a count, track width, m
     residual = _without_slope(pair, residual, quantum_m)
     total = running_sum(residual)
     mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
@@ -234,13 +231,10 @@ def _measure_event(pair: WheelPair, residual: Floats, windows: list[Window], beg
 
 def _find_wheel(pair: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
                 latitude: float, event: Event) -> int:
-    """
-    Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it.
-
-    A slip of the right wheel by x moves the mean of the wheels by x / 2 relative to the IMU, one
-    of the left wheel by -x moves it by -x / 2. The noise is the difference of mean and IMU
-    elsewhere.   mean : (n,) path of the mean, m, at the rows of ``pair``.
-    """
+    """Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it."""
+    # a slip of the right wheel by x moves the mean path of the wheels, m, by x / 2 relative to the
+    # IMU, one of the left by -x moves it by -x / 2; the noise is the difference of mean and IMU
+    # elsewhere
     begin, end, size = event
     grid = np.arange(max(track.t[0], pair.t[0]), min(track.t[-1], pair.t[-1]), slip.SPIN_GRID)
     margin = 1.0        # s each side of a slip, in which speeds are set equal

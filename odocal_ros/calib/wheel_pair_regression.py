@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, running_sum, runs
+from odocal_ros.nav.time_series import running_mean
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import robust_fit, SENT_TWICE_REMEDY, WheelPair
 from odocal_ros.settings.levels import TRACK_WIDTH
@@ -55,25 +56,15 @@ def right_path_regressors(pair: WheelPair, metres_per_unit: float) -> Floats:
     acceleration moves from tyre to tyre.
     """
     mean = (pair.left + pair.right) / 2
-    speed, rate = (_smooth(np.gradient(x, pair.step), MEAN_STEPS // 2)
+    speed, rate = (running_mean(np.gradient(x, pair.step), MEAN_STEPS // 2)
                    for x in (mean, pair.turn))
     load = running_sum(metres_per_unit * (speed**2 * rate)[1:] * pair.step)
     return np.stack([pair.left, pair.turn, pair.t - pair.t[0], speed, rate, load], -1)
 
 
-def _smooth(x: Floats, reach: int) -> Floats:
-    """Return the means of x over ``reach`` rows to each side: (n,)."""
-    padded = np.pad(x, reach, mode='edge')
-    return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode='valid')
-
-
 def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
                    ) -> tuple[Floats, Floats] | tuple[None, None]:
-    """
-    Return coefficients, (k,), of (n, k) regressors of the right path, and their covariance.
-
-    The regressors are those of ``right_path_regressors`` and any others. None with too few cells.
-    """
+    """Return coefficients, (k,), and their covariance; regressors: (n, 6) as above and others."""
     edges = np.arange(0, len(pair.t), MEAN_STEPS)      # of cells of a second
     design, y = np.diff(regressors[edges], axis=0), np.diff(pair.right[edges])
     keep = np.logical_and.reduceat(pair.known, edges[:-1])[:len(y)]

@@ -54,6 +54,12 @@ def interpolated(times: Floats, t: Floats, x: Floats) -> Floats:
     return np.stack([np.interp(times, t, column) for column in x.T], -1)
 
 
+def running_mean(x: Floats, side_rows: int) -> Floats:
+    """Return the means of each row and ``side_rows`` rows to each side: (n,)."""
+    padded, count = np.pad(x, side_rows, mode='edge'), 2 * side_rows + 1
+    return np.convolve(padded, np.full(count, 1 / count), mode='valid')
+
+
 def robust_sigma(residual: NDArray[np.float64]) -> float:
     """Return the standard deviation of residuals that are mostly normal about 0: (n,)."""
     sigma: float = np.median(np.abs(residual)) / NORMAL_MEDIAN

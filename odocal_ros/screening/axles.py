@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.odometer import mean_travel, Travel
-from odocal_ros.nav.time_series import running_integral
+from odocal_ros.nav.time_series import running_integral, running_mean
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import (
     broken_wheel_reasons,
@@ -29,7 +29,7 @@ Wheel = TypeVar('Wheel')
 Axle = tuple[Travel, ...]
 STEER_GRID = 0.1                # s, judgement: steps in which turn rates are squared
 CELL_STEPS = 10                 # judgement: steps of a cell of the fit, 1 s
-SMOOTHING = np.full(11, 1 / 11)      # judgement: running mean of the speed, 1.1 s
+SMOOTHED_STEPS = 5              # judgement: to each side, in the running mean of the speed, 1.1 s
 SLOW_SPEED_SHARE = 0.05         # judgement: of the top speed, below which a turn rate is noise
 # judgement: share of the path by which a steered axle rolls farther; less has no effect on scale
 MIN_STEERED_SHARE = 2e-5
@@ -117,12 +117,9 @@ def _distances_ahead(axles: list[Axle], imu: Imu, marks: tuple[float, float],
 
 def _squared_distance(axle: Travel, other: Travel, imu: Imu, marks: tuple[float, float],
                       uncertain_t: Floats) -> tuple[float, float]:
-    """
-    Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible.
-
-    A fit explains the travel of the axle by that of the other one, the additional path of a
-    steered axle (its coefficient is the squared distance) and the turn.
-    """
+    """Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible."""
+    # its travel is that of the other axle, the additional path of a steered axle times the squared
+    # distance, and the turn
     pair = wheels_on_grid((axle, other), imu, marks, STEER_GRID, uncertain_t)    # left: axle
     if pair is None:
         return 0.0, 0.0
@@ -152,8 +149,7 @@ def steering_path(t: Floats, turn: Floats, s: Floats, ahead: float = 0.0,
     With u the speed at the wheel along the vehicle and r the turn rate, the additional speed is
     sqrt(u^2 + (ahead r)^2) - |u| = (ahead r)^2 / (sqrt(u^2 + (ahead r)^2) + |u|).
     """
-    rate, speed = np.gradient(turn, t), np.gradient(s, t)
-    speed = np.convolve(np.pad(speed, len(SMOOTHING) // 2, mode='edge'), SMOOTHING, mode='valid')
+    rate, speed = np.gradient(turn, t), running_mean(np.gradient(s, t), SMOOTHED_STEPS)
     u = speed - left * rate
     additional = np.sign(u) * rate**2 / (np.hypot(u, ahead * rate) + np.abs(u) + 1e-12)
     additional[np.abs(speed) < SLOW_SPEED_SHARE * np.abs(speed).max()] = 0.0

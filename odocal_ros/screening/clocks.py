@@ -122,11 +122,6 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
     return lags
 
 
-def _may_be_clock_step(stamp_ns: Ints) -> Bools:
-    step: Floats = np.diff(stamp_ns) * 1e-9
-    return (step <= 0) | (step > CLOCK_STEP)
-
-
 def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
     """Return the leg with stamps as if no clock had been set during it, and CLOCK_SET reasons."""
     rows: dict[str, Samples] = {}
@@ -158,13 +153,12 @@ def without_clock_steps(leg: Leg) -> tuple[Leg, list[Reason]]:
 
 
 def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
-    """
-    Return the rows after which a clock was set, and the change, s.
-
-    The stamps step there, but the arrivals do not, so that the median lag changes.
-    """
+    """Return the rows after which a clock was set, and the change, s, of the median lag there."""
+    def may_be_clock_step(stamp_ns: Ints) -> Bools:
+        step_s: Floats = np.diff(stamp_ns) * 1e-9
+        return (step_s <= 0) | (step_s > CLOCK_STEP)
     if len(samples.stamp_ns) < 2 * STEP_LAG_ROWS or not map_windows(
-            _may_be_clock_step, samples.stamp_ns).any():
+            may_be_clock_step, samples.stamp_ns).any():
         return np.empty(0, np.int64), np.empty(0)
     step, lag = np.diff(samples.stamp_ns) * 1e-9, _lag(samples)
     advance = lag[:-1] - lag[1:]        # of stamps over arrivals

@@ -30,7 +30,8 @@ SMOOTHER_SIGMAS = 4.0     # statistical: significance of smoother rows: by chanc
 
 def even_imu_times(t: Floats, w: Floats, f: Floats) -> Floats:
     """Return the sampling times (n,), s, of rows by stamps t; w, f: (n, 3), in any unit."""
-    interval = _interval(t)
+    every_100th = t[::100]
+    interval = float(np.median(np.diff(every_100th))) / 100 if len(every_100th) > 1 else 0.0
     per_block = int(BLOCK_TIME / interval) if interval > 0 else 0
     if per_block < 10 or len(t) < WINDOW_BLOCKS * per_block:
         return t
@@ -40,12 +41,6 @@ def even_imu_times(t: Floats, w: Floats, f: Floats) -> Floats:
     has_jitter = np.median(np.abs(stamps - even)) > JITTER_SHARE * interval
     values = (column[tested] for column in (*w.T, *f.T))
     return even_times.all_times(t) if has_jitter and _is_smoother(stamps, even, values) else t
-
-
-def _interval(t: Floats) -> float:
-    """Return the interval of rows, s, by the median duration of 100 intervals."""
-    every_100th = t[::100]
-    return float(np.median(np.diff(every_100th))) / 100 if len(every_100th) > 1 else 0.0
 
 
 class _EvenTimes:

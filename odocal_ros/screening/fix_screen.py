@@ -279,11 +279,7 @@ def _deviations(t: Floats, fix_steps: Complexes,
 
 
 def _without_delay(deviation: Complexes, delay_rate: Complexes) -> Floats:
-    """
-    Return sizes of deviations, (n,) m, after removal of the part by a common delay.
-
-    delay_rate : (n,) change of the deviation for each second of delay, m/s.
-    """
+    """Return sizes of deviations, (n,) m, without the part by a common delay; delay_rate: m/s."""
     size = np.maximum(np.abs(delay_rate), 1e-9)
     delays = (deviation * delay_rate.conj()).real / size**2
     order = np.argsort(delays)

@@ -138,13 +138,9 @@ def orientation_of(binned: Accelerations) -> ImuOrientation | None:
 
 
 def corrected_forward_axis(orientation: ImuOrientation | None, f: Floats) -> Floats:
-    """
-    Return f, (3,), scale times forward axis, with the yaw of the IMU orientation if far from it.
-
-    A difference below 10 deg, or 3 sigma, has no effect on the detection of slips.
-    """
+    """Return f, scale times forward axis, (3,), rotated to the IMU orientation if far from it."""
     yaw, pitch = mounting_from_forward(f)
-    min_difference = np.deg2rad(10.0)
+    min_difference = np.deg2rad(10.0)    # a smaller one has no effect on slips
     if orientation is None or abs(float(wrap(orientation.yaw - yaw))) < max(
             min_difference, 3 * orientation.sigma):
         return f

@@ -31,11 +31,7 @@ ROUNDING_COUNTS = 2.5     # judgement: largest deviation of a row by rounding
 
 def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm,
                    name: str = 'odometer') -> tuple[Floats, list[Reason]]:
-    """
-    Return the sampling times of rows stamped at t, (n,) s, and the reason if rows are late.
-
-    name : of the odometer, in the reason.
-    """
+    """Return the sampling times, (n,) s, of rows stamped at t, and the reason if rows are late."""
     if len(t) < 4 * NODE_STEP:
         return t, []
     is_integer = np.issubdtype(samples.value.dtype, np.integer)
@@ -222,12 +218,9 @@ def _cubic_deviation(t: Floats, travel: Floats, rows: Ints) -> Floats:
 
 def _times_by_travel(t: Floats, travel: Floats, before: int, after: int,
                      interval: float) -> Floats:
-    """
-    Return the times of the rows between two rows by their travel, if they are a burst.
-
-    The speed is assumed constant. A burst is short, and its apparent speed is far higher than the
-    adjacent ones; the rows of other intervals keep their stamps.
-    """
+    """Return the times of the rows between two rows by travel, if they are a burst."""
+    # a burst is short, and its apparent speed far above the adjacent speeds: constant speed is
+    # assumed
     rows = np.arange(before + 1, after)
 
     def speed(first: int, last: int) -> float:

@@ -113,11 +113,7 @@ def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | No
 
 
 def _sections_between_stops(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
-    """
-    Return the first and the last step of each section of motion after a stop: (k,) rows of t each.
-
-    t : (n,) s, steps of REVERSING_STEP.
-    """
+    """Return the first and the last step of each section of motion that begins with a stop."""
     half = ACCELERATION_TIME / 2
     speed = np.abs(travel.at(t + half) - travel.at(t - half)) / ACCELERATION_TIME
     top = np.percentile(speed, 95)
@@ -151,13 +147,9 @@ class _Forces:
 
 def _force_ratio(t: Floats, acceleration: Floats, force: _Forces, begin: int,
                  end: int) -> tuple[float, float]:
-    """
-    Return the ratio of force to odometer acceleration from step begin to end, and its sigma.
-
-    A fit of the force by acceleration, constant and linear drift, from the stop before to 12 s
-    after the begin. The gravity that enters x as the vehicle pitches is removed: up at the stop,
-    by the integral of the force, is rotated by the gyro.
-    """
+    """Return the ratio of force to odometer acceleration from step begin to end, and its sigma."""
+    # fit by acceleration, constant and drift. Gravity that enters x as the vehicle pitches is
+    # removed: up at the stop, by the integral of the force, is rotated by the gyro
     first = max(0, begin - round((STOP_TIME + ACCELERATION_TIME) / REVERSING_STEP))
     max_duration = 12.0    # s after a stop that are used: later the tilt drifts
     rows = slice(first, min(len(t), end + 1, begin + round(max_duration / REVERSING_STEP)))

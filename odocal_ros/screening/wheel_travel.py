@@ -47,11 +47,8 @@ class RolloverSpan:
 
 
 def hidden_span(value: Values, step: Floats) -> RolloverSpan | None:
-    """
-    Return the rollovers of a counter by its values, (n,), and steps, (n - 1,); None without any.
-
-    A rollover is a jump against the travel, relative to the usual step (a running median).
-    """
+    """Return the rollovers of a counter by values, (n,), and steps, (n - 1,); None without any."""
+    # they are jumps against the travel, relative to the usual step, a running median
     if len(step) < MIN_STEPS or not step.any():
         return None
     side_steps = 7    # on each side of a step, in its running median

@@ -43,11 +43,7 @@ LARGEST_LAST_STEP = 0.02
 
 def fit_run(run: Run, known: PriorKnowledge,
             after_pass: Callable[[int, float], None] = lambda *_: None) -> Fit:
-    """
-    Return the estimate of a run.
-
-    after_pass : is called with the number of the pass and its largest step, in sigmas.
-    """
+    """Return the estimate of a run; after_pass gets the pass and the largest step in sigmas."""
     initial = first_values(run, known.width)
     scale = (initial.left + initial.right) / 2
     prior_mean, prior = priors(run, known, initial.left, initial.right, initial.width)

@@ -245,9 +245,8 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
         else:
             converged = bool(np.abs(step).max() < STEP_LIMIT)
             break
-        largest = np.abs(step).max()
-        converged = bool(largest < STEP_LIMIT
-                         or (largest < 1e3 * STEP_LIMIT and new_value == value))
+        step_limit = STEP_LIMIT if new_value < value else 1e3 * STEP_LIMIT
+        converged = bool(np.abs(step).max() < step_limit)
         q, r, J, value = q + step, r_new, J_new, new_value
     covariance, condition = _covariance(leg, r, J, space, robust)
     # sigma of right minus left: by scatter, and by the bend of any track

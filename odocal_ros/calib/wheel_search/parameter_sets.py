@@ -77,11 +77,8 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
 
 
 def irreducible(p: int, m: int) -> tuple[int, ...]:
-    """
-    Return the first monic polynomial of degree m, over the numbers 0..p-1, that has no factor.
-
-    A polynomial is the tuple of its coefficients, that of the lowest power first.
-    """
+    """Return the first monic polynomial of degree m over 0..p-1 that has no factor."""
+    # a polynomial is the tuple of its coefficients, that of the lowest power first
     factors = [(*low, 1) for d in range(1, m // 2 + 1) for low in product(range(p), repeat=d)]
     for low in product(range(p), repeat=m):
         candidate = (*low, 1)
