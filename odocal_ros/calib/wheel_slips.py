@@ -47,7 +47,7 @@ class WheelSlips:
         return np.concatenate([*t, []]), sigma
 
 
-NO_SLIPS = WheelSlips(np.empty(0), np.empty(0), np.empty(0), np.empty(0, int))
+NO_SLIPS = WheelSlips(np.empty(0), np.empty(0), np.empty(0), np.empty(0, int))    # definition
 
 
 def join_axles(axles: Sequence[WheelSlips], count: int) -> WheelSlips:

@@ -72,7 +72,7 @@ def usable_axles(wheels: Wheels, imu: Imu,
         reasons.append(Reason(Code.WHEELS_STEERED, f'{_subject(steered)} steered: a '
                               'steered wheel travels farther in turns. The scale factor is that '
                               f'of the mean of {_names(unsteered)}'))
-    return wheels.replaced(working), reasons
+    return replace(wheels, wheels=tuple(working)), reasons
 
 
 def _working_wheel(axle: Axle, faults: Sequence[Reason]) -> Axle:

@@ -9,7 +9,7 @@ uses 64 bits, the other 16 in a message of 64. Such rollovers are jumps opposite
 of the same size: the span.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -163,35 +163,30 @@ class Wheels:
     """Travel of the wheels, and its uncertain parts."""
 
     wheels: tuple[Travel, ...]
-    # for each wheel: times of uncertain travel, (k,) s, and its sigmas, (k,) scale units
-    uncertain_travel: tuple[tuple[Floats, Floats], ...]
+    # name of a wheel -> times of uncertain travel, (k,) s, and its sigmas, (k,) scale units
+    uncertain_travel: dict[str, tuple[Floats, Floats]]
+
+    @property
+    def _unsteered(self) -> list[Travel]:
+        return [wheel for wheel in self.wheels if not wheel.distance_ahead]
 
     @cached_property
     def mean(self) -> Travel:
         """Return the mean of the wheels that do not steer; the first one if another is empty."""
-        unsteered = [self.wheels[k] for k in self._unsteered]
+        unsteered = self._unsteered
         return mean_travel(unsteered) if all(len(wheel.t) for wheel in unsteered) else unsteered[0]
 
     @property
     def uncertain_t(self) -> Floats:
         """Return the times at which the mean is uncertain, s."""
-        return np.concatenate([self.uncertain_travel[k][0] for k in self._unsteered])
+        return np.concatenate([self.uncertain_travel[wheel.name][0] for wheel in self._unsteered])
 
     @property
     def uncertain_sigma(self) -> Floats:
         """Return the sigmas of the mean at these times, scale units."""
-        sigma: Floats = np.concatenate([self.uncertain_travel[k][1] for k in self._unsteered])
+        sigma: Floats = np.concatenate([self.uncertain_travel[wheel.name][1]
+                                        for wheel in self._unsteered])
         return sigma / len(self._unsteered)
-
-    @property
-    def _unsteered(self) -> list[int]:
-        return [k for k, wheel in enumerate(self.wheels) if not wheel.distance_ahead]
-
-    def replaced(self, kept: Sequence[Travel]) -> 'Wheels':
-        """Return the wheels ``kept``, each with the uncertain travel of the wheel of its name."""
-        by_name = {wheel.name: uncertain for wheel, uncertain in zip(
-            self.wheels, self.uncertain_travel, strict=True)}
-        return Wheels(tuple(kept), tuple(by_name[wheel.name] for wheel in kept))
 
 
 def travel_of_wheels(leg: Leg, config: Config,
@@ -204,7 +199,7 @@ def travel_of_wheels(leg: Leg, config: Config,
     """
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
-    wheels, uncertain, reasons = list[Travel](), list[tuple[Floats, Floats]](), list[Reason]()
+    wheels, uncertain, reasons = list[Travel](), dict[str, tuple[Floats, Floats]](), list[Reason]()
     for slot, name in zip(slots, names, strict=True):
         form = leg.form_of(slot)
         if _form_text(form) != _form_text(leg.form):
@@ -213,22 +208,21 @@ def travel_of_wheels(leg: Leg, config: Config,
                 f'{names[0]} wheel {_form_text(leg.form)}: they cannot be averaged, so only the '
                 f'{names[0]} wheel is used', 'Publish both wheels as one kind of value. If only '
                 'the modulus differs, set odometer.wrap.'))
-            return Wheels(tuple(wheels[:1]), tuple(uncertain[:1])), reasons
+            return Wheels(tuple(wheels[:1]), uncertain), reasons
         (samples, t), row_reasons = usable_rows(slot)
         reasons += row_reasons
         if wheels and not len(t):
             reasons.append(Reason(
                 Code.WHEEL_DEAD, f'the {name} wheel has no usable value between the marks: only '
                 f'the {names[0]} wheel is used'))
-            return Wheels(tuple(wheels[:1]), tuple(uncertain[:1])), reasons
+            return Wheels(tuple(wheels[:1]), uncertain), reasons
         if len(slots) == 1 and len(config.odometer.wheel_keys) > 1 and len(t):
             reasons.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
                                   'marks: only the left wheel is used'))
-        wheel, uncertain_travel, wheel_reasons = _corrected_travel(samples, t, form, config, name)
+        wheel, uncertain[name], wheel_reasons = _corrected_travel(samples, t, form, config, name)
         wheels.append(wheel)
-        uncertain.append(uncertain_travel)
         reasons += wheel_reasons
-    return Wheels(tuple(wheels), tuple(uncertain)), reasons
+    return Wheels(tuple(wheels), uncertain), reasons
 
 
 def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
