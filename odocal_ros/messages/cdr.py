@@ -94,12 +94,20 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 } | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in NUMBER_TYPES}
 
 
+class Place(NamedTuple):
+    """Place of a value in a message, or of the first value of a list."""
+
+    offset: int      # bytes
+    dtype: str       # of numpy
+    length: int = 1  # of the list
+
+
 class AdjacentValues(NamedTuple):
     """Adjacent values of one type in a message."""
 
-    place: slice                      # their bytes
+    span: slice                       # their bytes
     dtype: np.dtype[Any]              # of a value
-    packed_type: np.dtype[Any]        # of all of them as one item
+    packed_type: np.dtype[Any]        # of all of them as one item, which is copied at once
     width: int                        # number of values
 
 
@@ -107,15 +115,15 @@ class AdjacentValues(NamedTuple):
 class Layout:
     """Offsets of the fields of a message, and the bytes common to all messages of this layout."""
 
-    # by path: offset and type of a value; of a list also its length; content of a list of strings
-    places: dict[str, tuple[int, str]] = field(default_factory=dict)
-    lists: dict[str, tuple[int, str, int]] = field(default_factory=dict)
+    # by path: single values, lists of numbers, and the content of lists of strings
+    values: dict[str, Place] = field(default_factory=dict)
+    lists: dict[str, Place] = field(default_factory=dict)
     texts: dict[str, list[str]] = field(default_factory=dict)
     # ranges of the common bytes (encoding, lengths, texts), and their content
     fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
     fixed_bytes: list[bytes] = field(default_factory=list)
     size: int = 4       # bytes of a message
-    _adjacent: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
+    _runs: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -124,52 +132,51 @@ class Layout:
 
     def count(self, path: str) -> int:
         """Return the length of a list, 0 if it is missing."""
-        return self.lists[path][2] if path in self.lists else 0
+        return self.lists[path].length if path in self.lists else 0
 
-    def find(self, path: str) -> tuple[int, str] | None:
-        """Return offset and dtype of a value, ``path[i]`` in a list; None if it is missing."""
-        if path in self.places:
-            return self.places[path]
+    def find(self, path: str) -> Place | None:
+        """Return the place of a value, ``path[i]`` in a list; None if it is missing."""
+        if path in self.values:
+            return self.values[path]
         match = ELEMENT_PATH.fullmatch(path)
         if match and int(match[2]) < self.count(match[1]):
-            offset, dtype, _ = self.lists[match[1]]
-            return offset + int(match[2]) * np.dtype(dtype).itemsize, dtype
+            first = self.lists[match[1]]
+            offset = first.offset + int(match[2]) * np.dtype(first.dtype).itemsize
+            return Place(offset, first.dtype)
         return None
 
-    def _places(self, paths: tuple[str, ...]) -> list[AdjacentValues] | None:
-        if paths not in self._adjacent:
-            self._adjacent[paths] = _adjacent_values([self.find(path) for path in paths])
-        return self._adjacent[paths]
+    def _runs_of(self, paths: tuple[str, ...]) -> list[AdjacentValues] | None:
+        """Return the values at some paths, adjacent ones together; None if one is missing."""
+        if paths not in self._runs:
+            self._runs[paths] = _adjacent_values([self.find(path) for path in paths])
+        return self._runs[paths]
 
     def columns(self, table: NDArray[np.uint8], paths: Sequence[str]) -> NDArray[Any] | None:
         """Return values of messages, (n, size) bytes: (n, paths); None if a path is missing."""
-        runs = self._places(tuple(paths))
+        runs = self._runs_of(tuple(paths))
         if runs is None:
             return None
-        values = [table[:, run.place].view(run.packed_type).copy().view(run.dtype).reshape(
+        values = [table[:, run.span].view(run.packed_type).copy().view(run.dtype).reshape(
             -1, run.width) for run in runs]
         return values[0] if len(values) == 1 else np.concatenate(values, axis=1)
 
     def record(self, columns: Sequence[Sequence[str] | None]) -> np.dtype[Any] | None:
-        """
-        Return the type of a message of this layout whose fields are the values at some paths.
-
-        None if a path is missing, or if the paths of a field are not adjacent.
-        """
-        runs = [self._places(tuple(paths)) if paths else None for paths in columns]
+        """Return a structured type with a field for each column; None if one is not adjacent."""
+        runs = [self._runs_of(tuple(paths)) if paths else None for paths in columns]
         single_runs = [run[0] for run in runs if run is not None and len(run) == 1]
         return None if len(single_runs) < len(runs) else np.dtype({
             'names': [str(k) for k in range(len(single_runs))], 'itemsize': self.size,
             'formats': [(run.dtype, (run.width,)) for run in single_runs],
-            'offsets': [run.place.start for run in single_runs]})
+            'offsets': [run.span.start for run in single_runs]})
 
     def unpackers(self, columns: Sequence[Sequence[str] | None]) -> list[Unpacker]:
         """Return a function for each field of ``record`` that returns its values; [] for None."""
         record = self.record(columns)
         fields = (record.fields or {}).values() if record is not None else ()
+        # such as '<3d' for three doubles
         return [partial(struct.Struct(
-            f'<{kind.shape[0]}{STRUCT_FORMATS[kind.base.str[1:]]}').unpack_from,
-            offset=offset) for kind, offset, *_ in fields]
+            f'<{dtype.shape[0]}{STRUCT_FORMATS[dtype.base.str[1:]]}').unpack_from,
+            offset=offset) for dtype, offset, *_ in fields]
 
     def fits(self, raw: bytes) -> bool:
         """Return True if a message has this layout."""
@@ -180,21 +187,20 @@ class Layout:
 _latest_layouts: dict[str, Layout] = {}      # by message type: most topics have only one
 
 
-def _adjacent_values(places: Sequence[tuple[int, str] | None]) -> list[AdjacentValues] | None:
-    """Return values by offset and type, adjacent ones joined; None if one is missing."""
+def _adjacent_values(places: Sequence[Place | None]) -> list[AdjacentValues] | None:
+    """Return values at some places, adjacent ones of a type joined; None if one is missing."""
     joined: list[tuple[slice, str, int]] = []      # bytes, type and number of values
     for place in places:
         if place is None:
             return None
-        offset, dtype = place
-        span, kind, count = joined[-1] if joined else (slice(0), '', 0)
-        stop = offset + np.dtype(dtype).itemsize
-        if kind == dtype and span.stop == offset:
-            joined[-1] = slice(span.start, stop), kind, count + 1
+        span, dtype, count = joined[-1] if joined else (slice(0), '', 0)
+        stop = place.offset + np.dtype(place.dtype).itemsize
+        if dtype == place.dtype and span.stop == place.offset:
+            joined[-1] = slice(span.start, stop), dtype, count + 1
         else:
-            joined.append((slice(offset, stop), dtype, 1))
-    return [AdjacentValues(span, np.dtype(kind), np.dtype((np.void, span.stop - span.start)), n)
-            for span, kind, n in joined]
+            joined.append((slice(place.offset, stop), place.dtype, 1))
+    return [AdjacentValues(span, np.dtype(dtype), np.dtype((np.void, span.stop - span.start)),
+                           count) for span, dtype, count in joined]
 
 
 def layout_of(msgtype: str, raw: bytes) -> Layout | None:
@@ -261,10 +267,8 @@ class _LayoutScan:
             if count:
                 self.align(size)
             offset = self.advance(size * count)
-            if is_list:
-                layout.lists[path] = offset, NUMPY_TYPES[kind], count
-            else:
-                layout.places[path] = offset, NUMPY_TYPES[kind]
+            places = layout.lists if is_list else layout.values
+            places[path] = Place(offset, NUMPY_TYPES[kind], count)
 
     def advance(self, count: int) -> int:
         """Move on by a number of bytes; return the offset before."""

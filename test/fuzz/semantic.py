@@ -67,7 +67,7 @@ def change_sqlite(rng, file, mutation):
 def put(kind, data, fields, change):
     """Return a message with the values of some fields changed."""
     data, layout = bytearray(data), layout_of(kind, bytes(data))
-    places = [np.ndarray(1, form, data, at) for at, form in map(layout.find, fields)]
+    places = [np.ndarray(1, form, data, at) for at, form, _ in map(layout.find, fields)]
     for place, value in zip(places, change(*(place[0].item() for place in places)), strict=True):
         place[0] = value
     return bytes(data)
@@ -144,7 +144,7 @@ def spliced(rng, rows):
     kind, fields = odometer_of(rows)
     n, factor = len(rows[kind]), math.exp(rng.choice([-1, 1]) * rng.uniform(0.005, 1.0))
     begin = rng.randrange(n // 5, n - n // 5)
-    at, form = layout_of(kind, rows[kind][begin][1]).find(fields[0])
+    at, form, _ = layout_of(kind, rows[kind][begin][1]).find(fields[0])
     first = np.frombuffer(rows[kind][begin][1], form, 1, at)[0].item()
     whole = int if kind == COUNTER else float
     put_all(rows, kind, fields, lambda x: [whole(first + (x - first) * factor)],
@@ -201,7 +201,7 @@ def wrapped(rng, rows):
 def carried(rng, rows):
     """Insert a standstill in which the vehicle is carried, or does not move."""
     kind, fields = odometer_of(rows)
-    at, form = layout_of(kind, rows[kind][0][1]).find(fields[0])
+    at, form, _ = layout_of(kind, rows[kind][0][1]).find(fields[0])
     value = [np.frombuffer(data, form, 1, at)[0] for _, data in rows[kind]]
     still = [k for k in range(60, len(value)) if value[k] == value[k - 15]]
     time_ns, wait_ns, again_ns = (rows[kind][rng.choice(still)][0],
