@@ -84,8 +84,8 @@ class PlannedDrive:
 
     def lengthen(self, metres: float) -> 'PlannedDrive':
         """Return the drive extended straight ahead by ``metres`` at its fastest moment."""
-        k = int(np.argmax(np.where(self.t >= 0, np.abs(self.speed), -1.0)))
-        return self._hold_row(k, metres / abs(self.speed[k]))
+        fastest = int(np.argmax(np.where(self.t >= 0, np.abs(self.speed), -1.0)))
+        return self._hold_row(fastest, metres / abs(self.speed[fastest]))
 
     def lengthen_rests(self, seconds: float) -> 'PlannedDrive':
         """Return the drive with ``seconds`` more rest before the start and at the stop mark."""
@@ -141,39 +141,39 @@ def with_marks(t: Floats, speed: Floats, yaw: Floats, slope: Floats, **more: Any
 
 def add_stop_and_start(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with one more stop: braking, 5 s of standing, acceleration."""
-    k = _middle_row(drive)
-    v = drive.speed[k]
-    ramp = abs(v) / BRAKING
+    row = _middle_row(drive)
+    cruise = drive.speed[row]
+    ramp = abs(cruise) / BRAKING
     stop_time = 5.0    # s of a stop
     t = _time_grid(2 * ramp + stop_time, ramp, ramp + stop_time)
-    return insert_section(drive, k, t,
+    return insert_section(drive, row, t,
                           np.interp(t, [0.0, ramp, ramp + stop_time, 2 * ramp + stop_time],
-                                    [v, 0.0, 0.0, v]), np.zeros_like(t))
+                                    [cruise, 0.0, 0.0, cruise]), np.zeros_like(t))
 
 
 def add_left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with a turn of 90 deg to the left and, a little later, one to the right."""
-    k = _middle_row(drive)
-    v = drive.speed[k]
+    row = _middle_row(drive)
+    cruise = drive.speed[row]
     shortest_turn, sideways_limit = 8.0, 2.0    # s; m/s^2
-    turn = max(shortest_turn, QUARTER * abs(v) / sideways_limit)
+    turn = max(shortest_turn, QUARTER * abs(cruise) / sideways_limit)
     between_turns = 5.0    # s straight between the two turns
     end = 2 * turn + between_turns
     t = _time_grid(end, turn, turn + between_turns)
-    return insert_section(drive, k, t, np.full_like(t, v), np.interp(
+    return insert_section(drive, row, t, np.full_like(t, cruise), np.interp(
         t, [0.0, turn, turn + between_turns, end], [0.0, QUARTER, QUARTER, 0.0]))
 
 
 def add_town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     """Return the drive with minutes of stop and go, with turns, before its last standstill."""
     moving = int(np.flatnonzero(np.abs(drive.speed) > REST_SPEED)[-1])
-    k = min(moving + 1, len(drive.t) - 1)
-    v, yaw = drive.speed[k], 0.0
+    row = min(moving + 1, len(drive.t) - 1)
+    last_speed, yaw = drive.speed[row], 0.0
     t, speed, turn_angle = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
-    brake = abs(v) / BRAKING
+    brake = abs(last_speed) / BRAKING      # s
     if brake > DRIVE_STEP:          # the drive ends in motion
         times = _time_grid(brake)
-        t, speed, turn_angle = [times], [v * (1 - times / brake)], [np.zeros_like(times)]
+        t, speed, turn_angle = [times], [last_speed * (1 - times / brake)], [np.zeros_like(times)]
     town_turn = 22.0, 30.0    # s, begin and end in the minute
     for minute in range(minutes):
         times = _time_grid(TOWN_T[-1], *TOWN_T[1:-1], *town_turn)
@@ -182,22 +182,22 @@ def add_town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
         speed.append(np.interp(times, TOWN_T, TOWN_SPEED))
         turn_angle.append(yaw + np.interp(times, town_turn, [0.0, angle]))
         yaw += angle
-    return insert_section(drive, k, *(np.concatenate(x) for x in (t, speed, turn_angle)))
+    return insert_section(drive, row, *map(np.concatenate, (t, speed, turn_angle)))
 
 
-def insert_section(drive: Drive, k: int, t: Floats, speed: Floats, turn_angle: Floats) -> Drive:
+def insert_section(drive: Drive, row: int, t: Floats, speed: Floats, turn_angle: Floats) -> Drive:
     """
-    Return the drive with a section inserted after row k; the rest is delayed and rotated.
+    Return the drive with a section inserted after a row; later rows are delayed and rotated.
 
-    drive : as planned.   k : row between the marks.   t, speed, turn_angle : (m,) s since row k,
-    above 0 and rising; m/s; rad to the left since row k.
+    row : its number, between the marks.   t, speed, turn_angle : of the section, (m,) s since the
+    row, above 0 and rising; m/s; rad to the left since the row.
     """
     return replace(
-        drive, t=np.concatenate([drive.t[:k + 1], drive.t[k] + t, drive.t[k + 1:] + t[-1]]),
-        speed=np.insert(drive.speed, k + 1, speed),
-        slope=np.insert(drive.slope, k + 1, np.full(len(t), drive.slope[k])),
-        yaw=np.concatenate([drive.yaw[:k + 1], drive.yaw[k] + turn_angle,
-                            drive.yaw[k + 1:] + turn_angle[-1]]))
+        drive, t=np.concatenate([drive.t[:row + 1], drive.t[row] + t, drive.t[row + 1:] + t[-1]]),
+        speed=np.insert(drive.speed, row + 1, speed),
+        slope=np.insert(drive.slope, row + 1, np.full(len(t), drive.slope[row])),
+        yaw=np.concatenate([drive.yaw[:row + 1], drive.yaw[row] + turn_angle,
+                            drive.yaw[row + 1:] + turn_angle[-1]]))
 
 
 def _middle_row(drive: PlannedDrive) -> int:

@@ -213,7 +213,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_fleet(args: argparse.Namespace) -> int:
     """Write the bags of a fleet; return 0."""
-    from odocal_ros.library.simulate_fleet import simulate_fleet
+    from odocal_ros.library.simulate import simulate_fleet
     out = Path(args.out)
     with Phase('simulating', args.quiet) as progress:
         manifest = simulate_fleet(
