@@ -1,24 +1,26 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every command in README and docs is run, here or where the table states."""
+"""Every command in README and docs is run; the table of real drives is made from data."""
 
 import json
 import re
 import shlex
 import shutil
+import sys
 
 from drives import drive, settings
 from pages import all_commands, blocks, fenced, PAGES, ROOT, yaml_blocks
 import pytest
 import yaml
 
-from odocal_ros.bagio.encode import counter, fix, imu
+from odocal_ros.bagio.encode import counter, fix, imu, twist
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.offline import cli
 from odocal_ros.output.tables import source_label
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config_file import read_config_file
+from tools import real_drives
 
 pytestmark = pytest.mark.slow
 
@@ -241,3 +243,42 @@ def test_a_plan_prints_the_text_on_the_page(capfd):
     plans = [json.loads(printed([*command, '--json'], capfd)) for command in words]
     found = [plan['methods']['two_point']['estimates']['scale_factor']['sigma'] for plan in plans]
     assert found == pytest.approx([2000e-6, 30e-6], rel=0.2)
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    """Return a folder of one drive that has a counter and a speed."""
+    made = drive(scenario='straight', duration=200.0, fix_noise='rtk')
+    speed = drive(scenario='straight', duration=200.0, fix_noise='rtk', odometer='speed')
+    write_bag(tmp_path / 'a_drive' / 'bag', [
+        imu('/imu/data', made.imu), fix('/fix', made.fix), counter('/ticks', made.odometer),
+        twist('/speed', speed.odometer)])
+    truth = {'odometer': {'pulses': '/ticks', 'twist': '/speed', 'k0_m_per_pulse': 0.02},
+             'scale': {'value': made.truth.scale / 0.02, 'sigma': 1e-4},
+             'yaw_mounting_deg': {'value': 1.0, 'sigma': 0.1}}
+    (tmp_path / 'a_drive' / 'truth.yaml').write_text(yaml.safe_dump(truth))
+    (tmp_path / 'no_drive').mkdir()
+    monkeypatch.setenv('ODOCAL_DATA', str(tmp_path))
+    return tmp_path
+
+
+def test_the_page_has_a_row_for_each_odometer(data, monkeypatch):
+    page = data / 'page.md'
+    page.write_text(f'before\n{real_drives.BEGIN}old\n{real_drives.END}after\n')
+    (data / 'pictures').mkdir()
+    monkeypatch.setattr(real_drives, 'PAGE', page)
+    monkeypatch.setattr(real_drives, 'GALLERY', data / 'gallery.md')
+    monkeypatch.setattr(sys, 'argv', ['real_drives', '--write'])
+    real_drives.main()
+    text = page.read_text()
+    assert text.startswith(f'before\n{real_drives.BEGIN}{real_drives.HEAD}| `a_drive` |')
+    assert text.endswith(f'{real_drives.END}after\n')
+    rows = [line.split(' | ') for line in text.splitlines() if line.startswith('| `a_drive`')]
+    assert [row[1] for row in rows] == ['`/ticks`', '`/speed`']
+    gallery = (data / 'gallery.md').read_text()
+    assert gallery.count('\n## ') == gallery.count('pictures/a_drive.svg') == 1
+    assert 'odometer: /ticks, because' in gallery
+    assert 'scale factor' in gallery
+    assert 'corrected' in (data / 'pictures' / 'a_drive.svg').read_text()
+    assert abs(float(rows[0][4])) < 4           # sigmas, of the counter against its truth
+    assert all(row[-2] in ('accepted', 'caution') for row in rows)

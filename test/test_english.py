@@ -145,10 +145,13 @@ def test_settings_are_described_in_short_sentences():
             assert len(sentence.split()) <= 30, setting.name
 
 
-def test_docstrings_and_comments_are_plain():
+def test_docstrings_and_comments_are_plain_and_say_what_is_returned():
     # 'name : meaning' and 'name=value' name parameters
     found = [f'{where}: {words}' for where, text in remarks()
              if (words := unused(re.sub(r'\b\w+ :|\b\w+=', ' ', text)))]
+    assert not found, '\n'.join(found)
+    vague = re.compile(r'Returns? (?:what|how|why|whether|where|which|when)\b|(?:Tell|Say)s?\b')
+    found = [f'{where}: {text.splitlines()[0]}' for where, text in remarks() if vague.match(text)]
     assert not found, '\n'.join(found)
 
 
@@ -158,12 +161,6 @@ def test_names_of_tests_are_plain():
              for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
              if isinstance(node, ast.ClassDef | ast.FunctionDef)
              and (words := unused(node.name.replace('_', ' ')))]
-    assert not found, '\n'.join(found)
-
-
-def test_docstrings_say_what_is_returned():
-    vague = re.compile(r'Returns? (?:what|how|why|whether|where|which|when)\b|(?:Tell|Say)s?\b')
-    found = [f'{where}: {text.splitlines()[0]}' for where, text in remarks() if vague.match(text)]
     assert not found, '\n'.join(found)
 
 

@@ -82,15 +82,6 @@ def test_factors_and_places_are_within_their_sigmas(options):
             assert beside['x_sigma'] < 0.02 * beside['x']
 
 
-def test_a_reversed_wheel_of_each_axle_is_reported():
-    one = made()
-    leg = one.leg().with_rows(**{WHEELS[k]: changed(one.wheels[k], value=lambda a: -a)
-                                 for k in (0, 2)})
-    inputs, found = screen(leg, config(one))
-    assert [reason.code for reason in found].count(Code.WHEEL_REVERSED) == 2
-    assert len(inputs.travels) == 4
-
-
 def test_the_mean_is_that_of_the_wheels_that_do_not_steer():
     one = made()
     inputs, found = screen(one.leg(), config(one))
@@ -153,11 +144,17 @@ def test_without_an_axle_that_is_known_not_to_steer_the_leg_is_rejected(dead):
     assert Code.WHEEL_LEFT_OUT not in codes(found)
 
 
-def test_a_single_dead_wheel_is_found():
+def test_a_single_dead_wheel_and_a_reversed_wheel_of_each_axle_are_found():
     one = made(wheels=3)
     _, found = screen(with_dead(one, (2,)), config(one))
     assert codes(found)[Code.WHEEL_DEAD].startswith(
         'front did not count: the travel is 0 % of that of the wheel that travels most')
+    one = made()
+    leg = one.leg().with_rows(**{WHEELS[k]: changed(one.wheels[k], value=lambda a: -a)
+                                 for k in (0, 2)})
+    inputs, found = screen(leg, config(one))
+    assert [reason.code for reason in found].count(Code.WHEEL_REVERSED) == 2
+    assert len(inputs.travels) == 4
 
 
 def test_slip_of_one_of_four_wheels_is_reported_and_factors_are_correct():

@@ -178,14 +178,11 @@ def rolled(readings, delay, square):
     return as_rolled(Travel(FINE, readings, 0.0), constants)(AT)
 
 
-def test_first_order_filter_is_corrected():
+def test_first_order_filter_and_moving_mean_are_corrected():
     readings = travel(FINE, 1 / (1 + 1j * ANGLE), T)
     np.testing.assert_allclose(rolled(readings, T, T**2), travel(AT), atol=ROUNDING)
     assert 0.1 * np.abs(rolled(readings, T, 0.0) - travel(AT)).max() > ROUNDING
-
-
-def test_moving_mean_is_corrected_except_for_its_third_moment():
-    """A mean over W has variance W^2 / 12 and no third moment; the filter has 2 T^3."""
+    # A mean over W has variance W^2 / 12 and no third moment; the filter has 2 T^3
     W = np.sqrt(12) * T
     answer = np.exp(-0.5j * BEAT * W) * np.sinc(BEAT * W / 2 / np.pi)
     found = rolled(travel(FINE, answer, W / 2), W / 2, T**2)

@@ -105,7 +105,7 @@ def test_window_sigma_is_that_of_white_fixes():
     assert 0.9 < np.sqrt(np.mean(np.square(z))) < 1.5
 
 
-def test_short_stationary_or_single_section_leg_has_no_windows():
+def test_windows_end_with_the_fixes_and_a_short_or_stationary_leg_has_none():
     assert window_scale(T[:0], np.empty((0, 2)), np.empty((0, 2))).shape == (0, 4)
     _, dead = driven()
     assert window_scale(T[:20], dead[:20], dead[:20])[:, 0].max(initial=0.0) <= 2.0
@@ -113,9 +113,6 @@ def test_short_stationary_or_single_section_leg_has_no_windows():
     dead = np.zeros((len(T), 2))
     dead[:, 0] = 1e-9 * T + 1e9 * np.clip(T - 1600.0, 0.0, None)      # at rest within rounding
     assert not len(window_scale(T, 1.001 * dead, dead))
-
-
-def test_last_window_may_end_one_rounding_after_the_last_fix():
     t = 1.203 + np.arange(34.0)
     t[-1] = 34.203      # the last window, 32.203 to 34.203 s, ends at 34.203000000000003 s
     even = np.stack([t, t], axis=-1)

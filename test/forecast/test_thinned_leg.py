@@ -36,7 +36,7 @@ def fed(form, slot, rows, chop):
     return cells
 
 
-def test_the_number_of_cells_is_limited_and_no_turn_is_lost():
+def test_the_number_of_cells_is_limited_no_turn_is_lost_and_vibration_is_none():
     t = np.arange(0.0, 4 * 3600.0, 0.05)          # four hours, the longest leg there may be
     rate = np.where((t % 60) < 3, 0.5, 0.0)       # 3 s turns, one a minute
     leg = fed(None, 'imu', imu_rows(t, rate), 12_000).leg(SECOND)
@@ -45,9 +45,6 @@ def test_the_number_of_cells_is_limited_and_no_turn_is_lost():
     turned = running_integral(seconds(leg, leg.imu), leg.imu.w_i[:, 2])[-1]
     assert turned == pytest.approx(1.5 * 240, abs=2 * 0.5 * 1.6)
     assert (np.diff(leg.imu.stamp_ns) > 0).all()
-
-
-def test_vibration_is_not_a_turn():
     t = np.arange(0.0, 300.0, 0.005)
     leg = fed(None, 'imu', imu_rows(t, np.sin(2 * np.pi * 10.03 * t)), 1000).leg(SECOND)
     # 10.03 Hz sampled every 0.1 s is a slow wave: single rows turn by 1 / (pi 0.03) = 10 rad;
