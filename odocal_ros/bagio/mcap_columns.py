@@ -68,8 +68,8 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
         columns = _join(later, columns) if later else columns
         if (columns.time_ns[1:] < columns.time_ns[:-1]).any():
             columns = columns.take(np.argsort(columns.time_ns, kind='stable'))
-        end = int(np.searchsorted(columns.time_ns, index[number].start_ns)) if number < len(
-            index) else len(columns.time_ns)
+        next_ns = index[number].start_ns if number < len(index) else LATEST_NS
+        end = int(np.searchsorted(columns.time_ns, next_ns))
         later = columns.take(slice(end, None)) if end < len(columns.time_ns) else None
         if end:
             yield _batch(columns.take(slice(end)), channels)
@@ -126,12 +126,12 @@ def _channel_mask(channel_numbers: Collection[int]) -> Bools:
 def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns | None:
     """Return the messages of chunks; None if any of them has an unexpected layout."""
     chunks = _concatenated(chunks)
-    starts = [_record_offsets(chunk) for chunk in chunks]
-    counts = np.array([len(offsets) for offsets in starts])
+    offsets = [_record_offsets(chunk) for chunk in chunks]
+    counts = np.array([len(chunk_offsets) for chunk_offsets in offsets])
     if not chunks or not counts.all():
         return None
     data = chunks[0].data
-    start = np.sort(np.concatenate(starts))
+    start = np.sort(np.concatenate(offsets))      # of each record in the data
     if start[0] < 0 or start[-1] > len(data) - HEAD.itemsize:
         return None
     # a view with a head at every offset of the buffer; only those of records are read
@@ -147,14 +147,19 @@ def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns
         and size.min() >= COUNTED_HEAD
         and start[first].tolist() == [chunk.begin for chunk in chunks])
     time_ns, channel = head['time_ns'].copy(), head['channel'].copy()
-    if not is_adjacent or not known_channels[channel].all():
+    if not (is_adjacent and known_channels[channel].all() and _are_times_as_stated(
+            chunks, time_ns, first)):
         return None
-    earliest, latest = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
-    for chunk, low, high in zip(chunks, earliest.tolist(), latest.tolist(), strict=True):
-        if high >= LATEST_NS or not (
-                chunk.start_ns <= low <= high <= max(chunk.end_ns, chunk.start_ns)):
-            return None
     return Columns(time_ns, channel, RawMessages(data, start + HEAD.itemsize, size - COUNTED_HEAD))
+
+
+def _are_times_as_stated(chunks: Sequence[Chunk], time_ns: Ints, first: Ints) -> bool:
+    """Return True if messages are within the times of their chunks; first : row of each chunk."""
+    earliest, latest = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
+    return all(high < LATEST_NS
+               and chunk.start_ns <= low <= high <= max(chunk.end_ns, chunk.start_ns)
+               for chunk, low, high in zip(chunks, earliest.tolist(), latest.tolist(),
+                                           strict=True))
 
 
 def _concatenated(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
