@@ -141,15 +141,15 @@ def with_parameters(config: Config, parameters: list[Parameter]) -> Config:
 
 def change_refusal(config: Config, results: dict[str, Any], parameters: list[Parameter]) -> str:
     """Return the refusal of parameters that only the node or its start may set, or ''."""
-    for p in parameters:
-        now = results.get(p.name)
-        if p.name in RESULTS and not (p.value == now or str(p.value) == str(now) == 'nan'):
-            return (f'{p.name} is set by the node after each leg; to restore a result, start the '
+    for parameter in parameters:
+        name, value, result = parameter.name, parameter.value, results.get(parameter.name)
+        if name in RESULTS and not (value == result or str(value) == str(result) == 'nan'):
+            return (f'{name} is set by the node after each leg; to restore a result, start the '
                     'node with --params-file calibration.yaml')
-        if p.name in SETTINGS and SETTINGS[p.name].read_only and (
-                _python_value(p.value) != attrgetter(p.name)(config)):
-            return (f'{p.name} is fixed at start-up: restart the node with '
-                    f'"--ros-args -p {p.name}:=VALUE"')
+        if name in SETTINGS and SETTINGS[name].read_only and (
+                _python_value(value) != attrgetter(name)(config)):
+            return (f'{name} is fixed at start-up: restart the node with '
+                    f'"--ros-args -p {name}:=VALUE"')
     return ''
 
 
