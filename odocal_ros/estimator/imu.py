@@ -24,7 +24,6 @@ from odocal_ros.data.arrays import (
     release_mapped_memory,
 )
 from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
     quat_conjugate,
@@ -44,6 +43,9 @@ SAMPLES_IN_CACHE, KEYFRAMES_IN_CACHE = 8192, 64
 # judgement, without an accelerometer: white noise, m/s^2/sqrt(Hz), by vehicle accelerations of
 # 1.5 m/s^2 for some seconds; random walk, m/s^2/sqrt(s), by slopes of a few per cent over a minute
 NO_ACCEL_NOISE, NO_ACCEL_WALK = 5.0, 0.01
+# lower limits: white noises, rad/s and m/s^2 per sqrt(Hz), and walks of the biases, the same per
+# sqrt(s). Physical: a tenth of navigation grade, since a sensor with a dead band has none at rest
+MIN_IMU_NOISE = {'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7}
 CHI2_3_MEDIAN = 2.366       # statistical: median of chi2 with 3 degrees of freedom
 CHI2_3_QUARTILE = 1.213     # statistical: its lower quartile
 
@@ -180,7 +182,7 @@ def sensor_noise(grade: Grade) -> dict[str, float]:
     """Return the sigmas of white noise and random walks of an IMU of this grade, SI, by level."""
     stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
-    return {name: max(sigma, MIN_NOISE.imu[name]) for name, sigma in stated.items()}
+    return {name: max(sigma, MIN_IMU_NOISE[name]) for name, sigma in stated.items()}
 
 
 def without_accelerometer(grade: Grade) -> Grade:
@@ -206,7 +208,7 @@ def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict
     # people may get in and out, or load, during most of a stop: use the quarter with least motion
     variances = {
         name: max(min(np.median(x) / CHI2_3_MEDIAN, np.quantile(x, 0.25) / CHI2_3_QUARTILE),
-                  MIN_NOISE.imu[name]**2)
+                  MIN_IMU_NOISE[name]**2)
         for name, x in zip(('gyro', 'accel'), both, strict=True)}
     return variances if leg.has_accelerometer else {'gyro': variances['gyro']}
 

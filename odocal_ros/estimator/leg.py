@@ -28,9 +28,10 @@ FIX_RATE = 20.0
 
 @dataclass(frozen=True, eq=False)
 class ExternalSamples:
-    """Samples of a sensor: arrays of one length. A subclass adds their values."""
+    """Samples of a sensor: arrays of one length. A subclass adds their d values."""
 
     t: Floats       # (m,) s since the start mark
+    sigma: Floats   # (m,) or (m, d), of the white noise
 
     def between(self, first: float, last: float) -> Self:
         """Return the samples between two times."""

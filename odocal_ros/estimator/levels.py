@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Noise levels: the variances that a fit estimates, docs/method.md (S26), and their lower limits.
+Noise levels: the variances that a fit estimates, docs/method.md (S26).
 
 Their uncertainty follows from the average information (S27b) of Gilmour, Thompson and Cullis
 (1995). V_i is the derivative of the covariance R of all rows by the logarithm of level i, and
@@ -12,7 +12,7 @@ R^-1 r are the weighted residuals. With q_i = V_i R^-1 r and g_i = J' R^-1 q_i,
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,30 +20,6 @@ from odocal_ros.data.arrays import Floats, work_array
 
 # of the time-correlated fix error, horizontal and vertical: spectral densities of its noise, m^2/s
 CORRELATED_LEVELS = ('slow', 'slow_up')
-
-
-@dataclass(frozen=True)
-class MinimumNoise:
-    """
-    Minimum sigma of each noise.
-
-    Physical: the best receivers of today; for an IMU a tenth of navigation grade, since one with a
-    dead band has no noise at rest.
-    """
-
-    fix: float = 0.005          # m, each axis, of the white and of the correlated fix error each
-    pose: float = 2e-4          # m, of positions in a local frame: motion capture
-    velocity: float = 0.005     # m/s, of an external velocity
-    heading: float = 5e-4       # rad, of an external heading
-    height: float = 0.02        # m, by air pressure
-    travel: float = 1e-3        # m, of a reading of the odometer
-    road: float = 2e-4          # m/sqrt(s) along the path: texture of the road under a tyre
-    # gyro rad/s/sqrt(Hz), accelerometer m/s^2/sqrt(Hz), their walks rad/s/sqrt(s), m/s^2/sqrt(s)
-    imu: dict[str, float] = field(default_factory=lambda: {
-        'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7})
-
-
-MIN_NOISE = MinimumNoise()
 
 
 @dataclass(frozen=True)

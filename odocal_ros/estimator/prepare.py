@@ -22,7 +22,6 @@ from odocal_ros.estimator.imu import (
     without_accelerometer,
 )
 from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, FIX_RATE, SmootherLeg, thinning
-from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.screening.inputs import Inputs
@@ -44,6 +43,9 @@ SPACING = 1.0
 MEAN_ROLL_SIGMA = 0.02
 # m/rad, physical: a pitch centre 1.4 m ahead of the odometer times a mean roll of 1.4 %
 LIFT_SIGMA = 0.02
+# m, each axis, lower limits of the white and of the correlated error of fixes and of poses.
+# Physical: the best receivers of today, motion capture
+MIN_FIX_NOISE, MIN_POSE_NOISE = 0.005, 2e-4
 # s, physical: height errors by ionosphere and orbits change by one sigma in this time
 HEIGHT_TIME = 900.0
 
@@ -105,7 +107,7 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
         unshared_constants=unshared_constants, total_turn=total_turn(leg, imu),
         correlation_time=config.gnss.correlation_time,
         rate_b=mean_rates_at(t, leg.t_imu, leg.w_b), angle_covariances=imu.angle_covariances(),
-        drift_time=drift_time(leg, t), min_fix_sigma=MIN_NOISE.pose if is_pose else MIN_NOISE.fix)
+        drift_time=drift_time(leg, t), min_fix_sigma=MIN_POSE_NOISE if is_pose else MIN_FIX_NOISE)
     for kind in FACTORS:
         if kind.is_present(problem):
             initial, minimum = kind.initial_levels(problem)

@@ -142,7 +142,7 @@ def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
     else:
         return {}
     yaw = np.interp(t, drive.t, drive.yaw)
-    return {'heading': Heading(t, yaw, np.full(len(t), noise), sigma, source)}
+    return {'heading': Heading(t, np.full(len(t), noise), yaw, sigma, source)}
 
 
 def _true_state(motion: _Motion, rows: Ints) -> State:

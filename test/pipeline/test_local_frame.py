@@ -13,7 +13,6 @@ import pytest
 
 from odocal_ros.data.samples import LOCAL_STATUS
 from odocal_ros.estimator import make_smoother_leg, prepare
-from odocal_ros.estimator.levels import MIN_NOISE
 from odocal_ros.estimator.prepare import _priors
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.geodesy import (
@@ -62,7 +61,7 @@ def estimates(leg, config):
     ids=['car', 'robot at walking speed, 91 m'])
 def test_poses_give_the_values_of_fixes(options, monkeypatch):
     # poses may be better than GNSS: here not
-    monkeypatch.setattr(prepare, 'MIN_NOISE', replace(MIN_NOISE, pose=MIN_NOISE.fix))
+    monkeypatch.setattr(prepare, 'MIN_POSE_NOISE', prepare.MIN_FIX_NOISE)
     made = drive(**options)
     # the same first sigma: a fit from another start ends within 0.03 sigma of it
     config = settings(made, **SMOOTHER, leg__min_distance=20.0, reference__default_sigma=2.5)

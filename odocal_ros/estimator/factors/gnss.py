@@ -18,9 +18,9 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.point_rows import ExternalRows, PointRows, Rows
-from odocal_ros.estimator.leg import enu_to_n, ExternalSamples, thinning
-from odocal_ros.estimator.levels import MIN_NOISE
+from odocal_ros.estimator.factors.point_rows import ExternalRows, PointRows
+from odocal_ros.estimator.leg import enu_to_n, ExternalSamples, SmootherLeg, thinning
+from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.receiver_filter import filter_error, odometer_error
@@ -32,6 +32,7 @@ from odocal_ros.settings.config import Config
 # With less, accelerations look like outliers
 FIRST_SIGMA = 0.5
 VELOCITY_SIGMA = 0.1      # m/s, if a receiver states none: physical, Doppler
+MIN_VELOCITY_NOISE = 0.005    # m/s, physical: the best receivers of today
 # prior sigmas of the delay of a velocity, s, and of the squared time constant of its filter, s^2:
 # physical, receivers have up to 0.25 s each
 TIME_SIGMA, LAG2_SIGMA = 0.25, 0.1
@@ -164,7 +165,6 @@ class Velocity(ExternalSamples):
     """Horizontal velocity of the antenna."""
 
     velocity_n: Floats      # (m, 2) m/s, east and north in n
-    sigma: Floats           # (m, 2) m/s
 
 
 class VelocityRows(ExternalRows):
@@ -172,7 +172,7 @@ class VelocityRows(ExternalRows):
 
     name, source = 'velocity', 'fix_velocity'
     level_columns = {'velocity': slice(0, 2)}
-    constants = layout.VELOCITY
+    constants, min_sigma = layout.VELOCITY, MIN_VELOCITY_NOISE
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Velocity | None:
@@ -185,7 +185,7 @@ class VelocityRows(ExternalRows):
         known = np.isfinite(variance) & (variance > 0)
         sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
         v_n = (enu_to_n(inputs, t, origin) @ samples.velocity_n[some, :, None])[:, :2, 0]
-        return Velocity(t, v_n, sigma)
+        return Velocity(t, sigma, v_n)
 
     @staticmethod
     def prior_sigmas(samples: Velocity, config: Config) -> Floats:
@@ -193,10 +193,9 @@ class VelocityRows(ExternalRows):
         return np.array([np.hypot(TIME_SIGMA, gnss.time_sigma), LAG2_SIGMA,
                          max(gnss.velocity_scale_sigma, 1e-6)])
 
-    def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        leg, state, points = problem.leg, point.state, point.points['velocity']
-        samples, k = problem.external['velocity'], points.interval
-        assert isinstance(samples, Velocity)
+    def rows(self, samples: Velocity, points: Points, point: LinearisationPoint,
+             leg: SmootherLeg) -> tuple[Floats, Floats, Floats]:
+        state, k = point.state, points.interval
         C, tau = state.C_nb[k], points.tau[:, None]
         C_nb = C @ points.R
         arm_v = leg.antenna_arm - leg.imu_arm + state.constants[layout.GNSS_ARM]
@@ -232,7 +231,7 @@ class VelocityRows(ExternalRows):
             rotate(transpose(C), acceleration - g)) * tau[:, :, None]
         J, c = J[:, :2] * factor, c[:, :2] * factor
         c[:, :, layout.VELOCITY_SCALE] = -v[:, :2]
-        return Rows(samples.velocity_n - factor * v[:, :2], J, c, np.asarray(1 / samples.sigma))
+        return samples.velocity_n - factor * v[:, :2], J, c
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
@@ -242,11 +241,5 @@ class VelocityRows(ExternalRows):
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         initial, minimum = super().initial_levels(problem)
-        samples = problem.external[cls.name]
-        assert isinstance(samples, Velocity)
-        sigma = float(np.median(samples.sigma))
+        sigma = float(np.median(problem.external[cls.name].sigma))
         return {name: max(x, (FIRST_SIGMA / sigma)**2) for name, x in initial.items()}, minimum
-
-    @staticmethod
-    def min_levels(samples: Velocity) -> dict[str, float]:
-        return {'velocity': (MIN_NOISE.velocity / float(np.median(samples.sigma)))**2}

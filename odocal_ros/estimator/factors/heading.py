@@ -15,10 +15,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
-from odocal_ros.estimator.leg import ExternalSamples, meridian_convergence, thinning
-from odocal_ros.estimator.levels import MIN_NOISE
-from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.factors.point_rows import ExternalRows
+from odocal_ros.estimator.leg import ExternalSamples, meridian_convergence, SmootherLeg, thinning
+from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.state import BG, GYRO, HEADING, M, PHI, SIZE_WITHOUT_SLOW
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.dead_reckoning import Origin
@@ -28,16 +27,16 @@ from odocal_ros.settings.config import Config
 
 # rad, judgement: white noise of a configured heading, negligible
 CONFIGURED_NOISE = 1e-4
+MIN_HEADING_NOISE = 5e-4    # rad, physical: the best receivers of today
 
 
 @dataclass(frozen=True, eq=False)
 class Heading(ExternalSamples):
     """Samples of the yaw of the IMU's x axis in n, at times ``t``."""
 
-    yaw: Floats         # (m,) rad
-    noise: Floats       # (m,) rad, sigma of the white noise
-    sigma: float        # rad, of the error that is constant over the leg
-    source_name: str    # the heading source, as in the settings
+    yaw: Floats             # (m,) rad
+    constant_sigma: float   # rad, of the error that is constant over the leg
+    source_name: str        # the heading source, as in the settings
 
 
 class HeadingRows(ExternalRows):
@@ -45,7 +44,7 @@ class HeadingRows(ExternalRows):
 
     name, source = 'heading', 'heading_noise'
     level_columns = {'heading': slice(0, 1)}
-    constants = slice(HEADING, HEADING + 1)
+    constants, min_sigma = slice(HEADING, HEADING + 1), MIN_HEADING_NOISE
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Heading | None:
@@ -53,7 +52,7 @@ class HeadingRows(ExternalRows):
         if not np.isnan(alignment.heading) and source in ('auto', 'fixed'):
             t = np.zeros(1)
             yaw = yaw_from_heading(alignment.heading) + meridian_convergence(inputs, t, origin)
-            return Heading(t, wrap(yaw), np.full(1, CONFIGURED_NOISE),
+            return Heading(t, np.full(1, CONFIGURED_NOISE), wrap(yaw),
                            alignment.heading_sigma, 'fixed')
         if source in ('auto', 'heading_topic'):
             samples, t = inputs.external['heading']
@@ -67,18 +66,16 @@ class HeadingRows(ExternalRows):
 
     @staticmethod
     def prior_sigmas(samples: Heading, config: Config) -> float:
-        return samples.sigma
+        return samples.constant_sigma
 
     @classmethod
     def details(cls, samples: Heading, constants: Floats, sigma: Floats) -> dict[str, Any]:
-        return {'source': samples.source_name, 'sigma_stated': samples.sigma,
+        return {'source': samples.source_name, 'sigma_stated': samples.constant_sigma,
                 'error': float(constants[HEADING]), 'error_sigma': float(sigma[HEADING])}
 
-    def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        samples = problem.external['heading']
-        assert isinstance(samples, Heading)
-        state, points = point.state, point.points['heading']
-        k = points.interval
+    def rows(self, samples: Heading, points: Points, point: LinearisationPoint,
+             leg: SmootherLeg) -> tuple[Floats, Floats, Floats]:
+        state, k = point.state, points.interval
         C = state.C_nb[k]
         x = (C @ points.R)[:, :, 0]     # x axis of the IMU in n
         # squared length of its horizontal part
@@ -92,11 +89,7 @@ class HeadingRows(ExternalRows):
         by_gyro = np.einsum('ki,kij->kj', yaw_by_rotation, C @ points.R_by_gyro)
         J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
         c[:, 0, HEADING] = -1.0
-        return Rows(residual[:, None], J, c, 1 / samples.noise[:, None])
-
-    @staticmethod
-    def min_levels(samples: Heading) -> dict[str, float]:
-        return {'heading': (MIN_NOISE.heading / float(np.median(samples.noise)))**2}
+        return residual[:, None], J, c
 
 
 def _from_orientations(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float,
@@ -120,4 +113,4 @@ def _from_orientations(inputs: Inputs, t: Floats, q: Floats, variance: Floats, o
         return None
     C = matrix_from_quat(q) @ C_ib
     yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + meridian_convergence(inputs, t, origin)
-    return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), source_name)
+    return Heading(t, np.full(len(t), sigma), wrap(yaw), float(max(sigma, 1e-5)), source_name)

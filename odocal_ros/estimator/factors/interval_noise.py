@@ -30,7 +30,7 @@ from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer import stamp_of
 from odocal_ros.estimator.imu import gyro_bias_at_rest, ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.levels import Levels, MIN_NOISE
+from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BG, P, PHI, V
 from odocal_ros.nav.odometer import Travel
@@ -48,6 +48,7 @@ MIN_VERTICAL_NOISE = 2e-3
 # m/rad, unmodelled lift of the axle per pitch of the body within an interval, as by kerbs shorter
 # than a wheelbase: initial value and lower limit, judgement; the value is estimated for each drive
 PITCHING, MIN_PITCHING = 0.03, 1e-4
+MIN_ROAD_NOISE = 2e-4   # m/sqrt(s) along the path, physical: texture of the road under a tyre
 # m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
 # rad, total turn angle: one corner does not determine sideslip, two do. Judgement
@@ -95,7 +96,7 @@ def road_levels(total_turn: float) -> tuple[dict[str, float], dict[str, float]]:
     sideslip, road = min_sideslip(total_turn)**2, 0.01**2      # m^2/s; road: initial
     return (dict.fromkeys(ALONG, road) | dict.fromkeys(SIDEWAYS, max(road, sideslip))
             | {'pitching': PITCHING**2},
-            dict.fromkeys(ALONG, MIN_NOISE.road**2) | dict.fromkeys(SIDEWAYS, sideslip)
+            dict.fromkeys(ALONG, MIN_ROAD_NOISE**2) | dict.fromkeys(SIDEWAYS, sideslip)
             | {'up': max(sideslip, MIN_VERTICAL_NOISE**2), 'pitching': MIN_PITCHING**2})
 
 

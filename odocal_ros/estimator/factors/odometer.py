@@ -21,7 +21,7 @@ from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import PointRows
-from odocal_ros.estimator.levels import LevelRightHandSides, Levels, MIN_NOISE
+from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import E, ODO_CLOCK, ODO_DELAY, ODO_LAG2
 from odocal_ros.nav.coarse_speed import SpeedInstants
@@ -42,6 +42,7 @@ THIRD_DERIVATIVE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / STENCIL_REACH**3
 # ages less their mean, and weights
 FILTER_AGES, FILTER_WEIGHTS = np.polynomial.laguerre.laggauss(5)[0] - 1, \
     np.polynomial.laguerre.laggauss(5)[1]
+MIN_READING_NOISE = 1e-3    # m, physical: of a reading of the best odometers of today
 MIN_FILTER_TIME = 0.2      # s, judgement: speeds closer in time differ by vibration
 
 
@@ -88,7 +89,7 @@ class TravelError(Factor):
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        minimum = MIN_NOISE.travel / problem.leg.rough_scale
+        minimum = MIN_READING_NOISE / problem.leg.rough_scale
         level = {'travel': max(problem.leg.travel.quantum**2 / 12, minimum**2)}
         return level, level
 

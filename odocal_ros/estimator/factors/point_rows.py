@@ -12,7 +12,6 @@ new sensor is one subclass of it, listed in ``equations.FACTORS``.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
@@ -21,7 +20,7 @@ import numpy as np
 from odocal_ros.data.arrays import blocks, Bools, Floats, Ints, work_array
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
-from odocal_ros.estimator.leg import ExternalSamples
+from odocal_ros.estimator.leg import ExternalSamples, SmootherLeg
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.problem import Problem
@@ -233,25 +232,17 @@ def rows_per_independent(rows: PointRows) -> float:
     return count
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """The rows of an external sensor at one state."""
-
-    raw: np.ndarray             # (m, d) residuals
-    J: np.ndarray               # (m, d, SIZE_WITHOUT_SLOW) derivatives by the keyframes before
-    J_constants: np.ndarray     # (m, d, M) derivatives by the constants
-    inverse_sigma: np.ndarray   # (m, d)
-
-
 class ExternalRows(PointRows):
     """The factor of a sensor of ``problem.external``, with constants of its own."""
 
     constants: ClassVar[slice]      # its indices in state.CONSTANTS
+    min_sigma: ClassVar[float]      # lower limit of the noise of a sample
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
-        self._rows = self.rows(problem, point)
-        super().__init__(problem, point.points[self.name])
-        self.raw = self._rows.raw
+        samples, points = problem.external[self.name], point.points[self.name]
+        super().__init__(problem, points)
+        self.raw, self._J, self._J_constants = self.rows(samples, points, point, problem.leg)
+        self._inverse_sigma = 1 / samples.sigma.reshape(self.raw.shape)
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> ExternalSamples | None:
@@ -269,8 +260,13 @@ class ExternalRows(PointRows):
         return {CONSTANTS[i]: {'value': float(constants[i]), 'sigma': float(sigma[i])}
                 for i in range(*cls.constants.indices(len(CONSTANTS)))}
 
-    def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        """Return the rows at a state."""
+    def rows(self, samples: Any, points: Points, point: LinearisationPoint,
+             leg: SmootherLeg) -> tuple[Floats, Floats, Floats]:
+        """
+        Return residuals, (m, d), and derivatives by keyframes before and by constants.
+
+        They have the shapes (m, d, SIZE_WITHOUT_SLOW) and (m, d, M).
+        """
         raise NotImplementedError
 
     @classmethod
@@ -283,17 +279,13 @@ class ExternalRows(PointRows):
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        return dict.fromkeys(cls.level_columns, 1.0), cls.min_levels(problem.external[cls.name])
-
-    @staticmethod
-    def min_levels(samples: Any) -> dict[str, float]:
-        """Return the lower limits of its noise levels, factors on the stated variances."""
-        raise NotImplementedError
+        minimum = (cls.min_sigma / float(np.median(problem.external[cls.name].sigma)))**2
+        return dict.fromkeys(cls.level_columns, 1.0), dict.fromkeys(cls.level_columns, minimum)
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
         columns = 0, n - SIZE_WITHOUT_SLOW
-        return np.pad(self._rows.J, ((0, 0), (0, 0), columns)), self._rows.J_constants
+        return np.pad(self._J, ((0, 0), (0, 0), columns)), self._J_constants
 
     def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        out: Floats = rows * self._rows.inverse_sigma[some, :, None]
+        out: Floats = rows * self._inverse_sigma[some, :, None]
         return out

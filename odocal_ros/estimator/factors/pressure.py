@@ -14,10 +14,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.point_rows import ExternalRows, Rows
-from odocal_ros.estimator.leg import ExternalSamples
-from odocal_ros.estimator.levels import MIN_NOISE
-from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.factors.point_rows import ExternalRows
+from odocal_ros.estimator.leg import ExternalSamples, SmootherLeg
+from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.state import BA, BG, GYRO, M, P, PHI, PRESSURE, SIZE_WITHOUT_SLOW, V
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.rotations import rotate, skew
@@ -31,6 +30,7 @@ SCALE_HEIGHT = 8435.0
 PRIOR_SIGMAS = 1e4, 8.4 / 3600, 0.015, 0.05
 EARTH_RADIUS = 6.371e6      # m, physical: mean radius
 HEIGHT_SIGMA = 0.15     # m, physical: of one sample, if a sensor states none
+MIN_HEIGHT_NOISE = 0.02    # m, physical: the best sensors of today
 RATE = 1.0              # Hz, judgement: of means; heights of a vehicle change more slowly
 
 
@@ -39,7 +39,6 @@ class Pressure(ExternalSamples):
     """Heights above an unknown zero."""
 
     height: Floats      # (m,) m
-    sigma: Floats       # (m,) m
 
 
 class PressureRows(ExternalRows):
@@ -47,7 +46,7 @@ class PressureRows(ExternalRows):
 
     name, source = 'pressure', 'air_pressure'
     level_columns = {'pressure': slice(0, 1)}
-    constants = PRESSURE
+    constants, min_sigma = PRESSURE, MIN_HEIGHT_NOISE
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Pressure | None:
@@ -61,20 +60,15 @@ class PressureRows(ExternalRows):
                                   for x in (t, samples.value, samples.variance))
         stated = np.sqrt(np.maximum(v_mean, 0.0) / count) * (SCALE_HEIGHT / p_mean)
         sigma = np.where(stated > 0, stated, HEIGHT_SIGMA / np.sqrt(count))
-        return Pressure(t_mean, -SCALE_HEIGHT * np.log(p_mean / p_mean[0]), sigma)
+        return Pressure(t_mean, sigma, -SCALE_HEIGHT * np.log(p_mean / p_mean[0]))
 
     @staticmethod
     def prior_sigmas(samples: Pressure, config: Config) -> Floats:
         return np.array(PRIOR_SIGMAS)
 
-    @staticmethod
-    def min_levels(samples: Pressure) -> dict[str, float]:
-        return {'pressure': (MIN_NOISE.height / float(np.median(samples.sigma)))**2}
-
-    def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        leg, state, points = problem.leg, point.state, point.points['pressure']
-        samples, k, tau = problem.external['pressure'], points.interval, points.tau
-        assert isinstance(samples, Pressure)
+    def rows(self, samples: Pressure, points: Points, point: LinearisationPoint,
+             leg: SmootherLeg) -> tuple[Floats, Floats, Floats]:
+        state, k, tau = point.state, points.interval, points.tau
         C, g = state.C_nb[k], gravity_n(state.p_n[k], leg.origin)
         dp = rotate(C, points.dp)
         dv = rotate(C, points.dv)
@@ -94,4 +88,4 @@ class PressureRows(ExternalRows):
         by_gyro = -up @ C @ points.dp_by_gyro - by_velocity @ C @ points.dv_by_gyro
         J[:, :, BG], c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
         c[:, 0, PRESSURE] = -by_constants
-        return Rows(raw[:, None], J, c, 1 / samples.sigma[:, None])
+        return raw[:, None], J, c

@@ -187,11 +187,12 @@ def last_step(fit: Fit) -> float:
 
 def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reason]:
     """Return the reason for an external heading that contradicts the drive; error : rad."""
-    if not isinstance(heading, Heading) or abs(error) < REMARK_SIGMAS * heading.sigma:
+    if not isinstance(heading, Heading) or abs(error) < REMARK_SIGMAS * heading.constant_sigma:
         return []
+    sigmas = abs(error) / heading.constant_sigma
     return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source_name}) differs by '
-                   f'{np.rad2deg(error):+z.2f} deg, {abs(error) / heading.sigma:.1f} sigma, from '
-                   'the heading estimated on this drive; it was down-weighted',
+                   f'{np.rad2deg(error):+z.2f} deg, {sigmas:.1f} sigma, from the heading '
+                   'estimated on this drive; it was down-weighted',
                    REMEDIES['heading_fixed' if heading.source_name == 'fixed' else
                             'heading_sent'])]
 
