@@ -221,8 +221,8 @@ def extend_warm_start(last: FitSummary, problem: Problem) -> FitSummary | None:
     t, last_t = problem.imu.t_keyframes, last.state.t
     rounding = 1e-6     # s
     nearest = np.clip(np.searchsorted(last_t, t - rounding), 0, len(last_t) - 1)
-    same = np.abs(last_t[nearest] - t) < rounding
-    n = len(t) if same.all() else int(np.argmin(same))      # keyframes that the last fit has
+    is_old = np.abs(last_t[nearest] - t) < rounding
+    n = len(t) if is_old.all() else int(np.argmin(is_old))      # keyframes that the last fit has
     # samples of the last 3 s may have arrived late
     if n < 2 or t[n - 1] < last_t[-1] - 3.0 or last.priors.used_count != problem.priors.used_count:
         return None

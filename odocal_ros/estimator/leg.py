@@ -35,9 +35,9 @@ class ExternalSamples:
 
     def between(self, first: float, last: float) -> Self:
         """Return the samples between two times."""
-        pick = (self.t >= first) & (self.t <= last)
-        columns = {one.name: getattr(self, one.name) for one in fields(self)}
-        return replace(self, **{name: column[pick] for name, column in columns.items()
+        inside = (self.t >= first) & (self.t <= last)
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: column[inside] for name, column in columns.items()
                                 if isinstance(column, np.ndarray)})
 
 
@@ -121,11 +121,12 @@ def drift_time(leg: SmootherLeg, t: Floats) -> Floats:
     length of the leg, divided in proportion to the path.
     """
     T = np.diff(t)
-    fastest = 5.0       # m/s, judgement: no robot indoors; the positions of a car are from GNSS
+    max_robot_speed = 5.0       # m/s, judgement: indoors; the positions of a car are from GNSS
     distance = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
-    if not leg.origin.is_local or (distance > fastest * T).any():
+    if not leg.origin.is_local or (distance > max_robot_speed * T).any():
         return T
-    path = np.max([np.abs(np.diff(one.at(t))) for one in leg.wheels or (leg.travel,)], axis=0)
+    path = np.max([np.abs(np.diff(wheel.at(t))) for wheel in leg.wheels or (leg.travel,)],
+                  axis=0)
     at_rest = 0.01      # share of the time, judgement: a pose may change without motion
     out: Floats = np.maximum(T.sum() * path / max(path.sum(), 1e-12), at_rest * T)
     return out

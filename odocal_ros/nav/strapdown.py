@@ -99,21 +99,23 @@ def _pairs(q: Floats) -> Pairs:
     return q[..., 3] + 1j * q[..., 0], q[..., 1] + 1j * q[..., 2]
 
 
-def _quats(a: Complexes, b: Complexes) -> Floats:
+def _quats(pairs: Pairs) -> Floats:
     """Return the unit quaternions x y z w of two complex rows: (n, 4)."""
+    a, b = pairs
     out = np.stack([a.imag, b.real, b.imag, a.real], axis=-1)
     out /= np.sqrt(np.einsum('ij,ij->i', out, out))[:, None]
     return out
 
 
-def _times(a: Complexes, b: Complexes, c: Complexes, d: Complexes) -> Pairs:
-    """Multiply quaternions a + b j and c + d j: with z = w + x i, y + z i for (a, b)."""
+def _product(p: Pairs, q: Pairs) -> Pairs:
+    """Return the products of quaternions a + b j and c + d j; a = w + x i, b = y + z i."""
+    (a, b), (c, d) = p, q
     return a * c - b * np.conj(d), a * d + b * np.conj(c)
 
 
 def prefix_product(q: Floats) -> Floats:
     """Return q_0, q_0 q_1, q_0 q_1 q_2 ...: (n, 4) to (n, 4), unit quaternions x y z w."""
-    return _quats(*_scan(*_pairs(q)))
+    return _quats(_scan(*_pairs(q)))
 
 
 def _scan(a: Complexes, b: Complexes) -> Pairs:
@@ -122,7 +124,7 @@ def _scan(a: Complexes, b: Complexes) -> Pairs:
     if n <= 2:
         if n == 2:
             a, b = a.copy(), b.copy()
-            a[1], b[1] = _times(a[0], b[0], a[1], b[1])
+            a[1], b[1] = _product((a[0], b[0]), (a[1], b[1]))
         return a, b
     width = min(SCAN_BLOCK, max(2, int(np.sqrt(n))))
     rows = -(-n // width)
@@ -130,11 +132,11 @@ def _scan(a: Complexes, b: Complexes) -> Pairs:
     A[:n], B[:n] = a, b
     A, B = (np.ascontiguousarray(x.reshape(rows, width).T) for x in (A, B))
     for k in range(1, width):
-        A[k], B[k] = _times(A[k - 1], B[k - 1], A[k], B[k])
+        A[k], B[k] = _product((A[k - 1], B[k - 1]), (A[k], B[k]))
     if rows > 1:
         ends_a, ends_b = _scan(A[-1, :-1], B[-1, :-1])
         for k in range(width):
-            A[k, 1:], B[k, 1:] = _times(ends_a, ends_b, A[k, 1:], B[k, 1:])
+            A[k, 1:], B[k, 1:] = _product((ends_a, ends_b), (A[k, 1:], B[k, 1:]))
     return A.T.reshape(-1)[:n], B.T.reshape(-1)[:n]
 
 
@@ -153,7 +155,7 @@ def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs
         C, D = c.reshape(-1, every), d.reshape(-1, every)
         c, d = C[:, 0], D[:, 0]
         for k in range(1, every):
-            c, d = _times(c, d, C[:, k], D[:, k])
+            c, d = _product((c, d), (C[:, k], D[:, k]))
         a[g:g + step], b[g:g + step] = c, d
         release_mapped_memory()
     return a, b
@@ -173,9 +175,8 @@ def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every:
         return t, np.empty((0, 4))
     kept = np.append(np.arange(0, len(t) - 1, every), len(t) - 1)
     t_out = map_rows(lambda k: t[k], kept)
-    a0, b0 = _pairs(q_nb0)
-    a, b = _products(t, w_b, every, bias)
-    a, b = _scan(np.append(a0, a), np.append(b0, b))
+    a, b = (np.append(first, steps) for first, steps in zip(
+        _pairs(q_nb0), _products(t, w_b, every, bias), strict=True))
     # n rotates with the Earth relative to the inertial frame that it equals at t[0]
-    e, f = _pairs_from_rotvec(np.multiply.outer(np.asarray(earth_rate_n), t[0] - t_out))
-    return t_out, _quats(*_times(e, f, a, b))
+    earth = _pairs_from_rotvec(np.multiply.outer(np.asarray(earth_rate_n), t[0] - t_out))
+    return t_out, _quats(_product(earth, _scan(a, b)))

@@ -27,7 +27,7 @@ from odocal_ros.estimator.factors.signals import Signals
 from odocal_ros.estimator.imu import sensor_noise, white_noise_at_rest
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BG, MEAN_ROLL, State
+from odocal_ros.estimator.state import ACCEL, BG, GYRO, MEAN_ROLL, P, State, V
 
 # sources in the budget, by level
 NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
@@ -91,10 +91,12 @@ class MotionRows(Factor):
         """Return ``Motion.jacobians`` of some intervals, with fitted signals."""
         begin, end, constants = self.motion.take(rows).jacobians(self.n)
         gyro = units[:, :, self.noise_mask('gyro')]
-        self.signals.fit_rates(rows, constants, begin[:, :, BG], gyro)
+        constants[:, :, GYRO] += self.signals.gyro_corrections(rows, begin[:, :, BG], gyro)
         if self.motion.fitted:
             estimates = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
-            self.signals.fit_forces(rows, constants, gyro, estimates)
+            by_velocity, by_position = self.signals.accel_corrections(rows, gyro, estimates)
+            constants[:, V, ACCEL] += by_velocity
+            constants[:, P, ACCEL] += by_position
             constants[:, D, MEAN_ROLL] += self.derivative_by_roll(rows, units)
         return begin, end, constants
 

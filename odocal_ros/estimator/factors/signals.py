@@ -30,68 +30,76 @@ LIKELY_NOISE = 10.0
 
 class Signals:
     """
-    Fitted turn rates and forces of the intervals of a motion.
+    Corrections of the derivatives by IMU errors, for the fitted signals of a motion.
 
-    sway : road noise in n, for the rows of velocity and of position: (K, 3) change of the sideways
-    and vertical velocity of the axle in an interval, m/s, and its integral, m.
+    road_velocity, road_position : road noise, the change of the sideways and vertical velocity of
+    the axle in an interval, and its integral: (K, 3) m/s, (K, 3) m, in n.
     """
 
     def __init__(self, motion: Motion) -> None:
         self.motion, state = motion, motion.state
         forward_n = state.C_nb @ state.forward
-        velocity = perpendicular(motion.axle.v_n, forward_n)
-        path = perpendicular(motion.residual[:, D], forward_n[:-1]) - velocity[:-1] * motion.T
-        self.sway = (layout.V, np.diff(velocity, axis=0)), (layout.P, path)
+        velocity = _perpendicular(motion.axle.v_n, forward_n)
+        path = _perpendicular(motion.residual[:, D], forward_n[:-1])
+        self.road_velocity = np.diff(velocity, axis=0)
+        self.road_position = path - velocity[:-1] * motion.T
 
-    def fit_rates(self, rows: slice, constants: Floats, by_bias: Floats, gyro: Floats) -> None:
+    def gyro_corrections(self, rows: slice, by_bias: Floats, gyro: Floats) -> Floats:
         """
-        Subtract the noise from derivatives by gyro errors that multiply a turn rate, in place.
+        Return the corrections of the derivatives by GYRO for fitted turn rates: (k, 18, g).
 
-        rows : slice of the intervals.   constants : (k, 18, M) derivatives.   by_bias : (k, 18, 3)
-        derivatives by the gyro bias.   gyro : (k, 18, 3 p) effects of unit gyro noises about the
-        axes of n at p times. Derivatives by g-sensitivity are not changed: accelerometer noise is
-        independent of the gyro.
+        by_bias : (k, 18, 3) derivatives by the gyro bias.   gyro : (k, 18, 3 p) effects of unit
+        gyro noises about the axes of n at p times. Derivatives by g-sensitivity are not changed:
+        accelerometer noise is independent of the gyro.
         """
-        part, columns = self.motion.take(rows), constants[:, :, layout.GYRO]
+        part = self.motion.take(rows)
         noise = rotate(transpose(part.C), part.residual[:, layout.PHI]) / part.T * part.fitted
         rate = part.sums.mean_rate + noise
-        bound = (LIKELY_NOISE**2 * (gyro[:, layout.PHI]**2).sum(axis=(1, 2))[:, None] / 3
+        # (rad/s)^2, of a rate that is likely noise
+        limit = (LIKELY_NOISE**2 * (gyro[:, layout.PHI]**2).sum(axis=(1, 2))[:, None] / 3
                  / part.T**2)
-        noise -= rate * bound / (rate**2 + bound)
+        noise -= rate * limit / (rate**2 + limit)
         by_bias = by_bias.copy()
         by_bias[:, layout.BG] = 0.0     # the rows of the bias walk do not depend on scale errors
+        out = np.zeros((*by_bias.shape[:2], len(layout.GYRO_ERRORS)))
         for i, (axis, signal) in enumerate(layout.GYRO_ERRORS.values()):
             if signal < FORCES:
-                columns[:, :, i] += by_bias[:, :, axis] * noise[:, signal, None]
+                out[:, :, i] = by_bias[:, :, axis] * noise[:, signal, None]
+        return out
 
-    def fit_forces(self, rows: slice, constants: Floats, gyro: Floats, estimates: Floats) -> None:
-        """Subtract the noise from the others; estimates : (k, 3 p) of the unit gyro noises."""
+    def accel_corrections(self, rows: slice, gyro: Floats,
+                          estimates: Floats) -> tuple[Floats, Floats]:
+        """
+        Return the corrections of the derivatives of velocity and position by ACCEL.
+
+        gyro : as above.   estimates : (k, 3 p) of these unit noises. The result is (k, 3, a) each.
+        """
         part = self.motion.take(rows)
         k, C = len(part.C), part.C[:, None]
         # effects on the rows of the estimated noise about each axis of b
         by_gyro = ((gyro.reshape(k, ROWS, -1, 3) @ C)
                    * (estimates.reshape(k, 1, -1, 3) @ C)).sum(2)
-        for axes, sway in self.sway:
-            self._by_forces(part, constants[:, axes, layout.ACCEL],
-                            rotate(transpose(part.C), sway[rows]), part.residual[:, axes],
-                            by_gyro[:, axes])
+        return (self._by_forces(part, self.road_velocity[rows], layout.V, by_gyro),
+                self._by_forces(part, self.road_position[rows], layout.P, by_gyro))
 
-    def _by_forces(self, part: Motion, columns: Floats, sway: Floats, residual: Floats,
-                   by_gyro: Floats) -> None:
-        """Correct the derivatives of velocity or position by ACCEL: columns (k, 3, a)."""
+    def _by_forces(self, part: Motion, road: Floats, columns: slice, by_gyro: Floats) -> Floats:
+        """Return the corrections of velocity or position, (k, 3, a); columns : V or P."""
         to_b = transpose(part.C)
-        by_gyro = to_b @ by_gyro      # (k, 3, 3) along an axis of b, by noise about an axis of b
-        by_accel = rotate(to_b, residual) - by_gyro.sum(axis=2)
+        road_b, residual_b = rotate(to_b, road), rotate(to_b, part.residual[:, columns])
+        by_gyro = to_b @ by_gyro[:, columns]     # along an axis of b, by noise about an axis of b
+        by_accel = residual_b - by_gyro.sum(axis=2)
+        out = np.empty((*road.shape, len(layout.ACCEL_ERRORS)))
         for i, (axis, signal) in enumerate(layout.ACCEL_ERRORS.values()):
             noise = np.zeros_like(by_accel)
-            noise[:, axis] = by_accel[:, signal] - sway[:, signal]
+            noise[:, axis] = by_accel[:, signal] - road_b[:, signal]
             if axis == signal:  # a force along one axis, turned about another, towards the third
                 for about, toward in ((axis - 1, axis - 2), (axis - 2, axis - 1)):
                     noise[:, toward] += by_gyro[:, toward, about]
-            columns[:, :, i] += rotate(part.C, noise)
+            out[:, :, i] = rotate(part.C, noise)
+        return out
 
 
-def perpendicular(x_n: Floats, forward_n: Floats) -> Floats:
+def _perpendicular(x_n: Floats, forward_n: Floats) -> Floats:
     """Return the components of vectors perpendicular to forward: (k, 3)."""
     out: Floats = x_n - np.einsum('ki,ki->k', x_n, forward_n)[:, None] * forward_n
     return out

@@ -64,8 +64,8 @@ class SlowError(factor.Factor):
         self.noise_variance = np.multiply.outer(1 - decay**2, self.variance) * self.jump
         a = self.decay = decay[:, None]
         # derivatives of decay and of ln noise_variance by the logarithm of the correlation time
-        self.da = a * self.T[:, None] / levels.correlation_time
-        self.dq = 1 - 2 * a * self.da / (1 - a**2)
+        self.decay_by_time = a * self.T[:, None] / levels.correlation_time
+        self.log_variance_by_time = 1 - 2 * a * self.decay_by_time / (1 - a**2)
         self.log_R = np.log(self.noise_variance).sum() + np.log(self.variance).sum()
 
     def residual(self) -> Floats:
@@ -124,7 +124,8 @@ class SlowError(factor.Factor):
         # the expected score of the complete data (Fisher's identity). Expected values: product,
         # driving noise times the error before; excess, begin: squares of noise and of the first
         # error, in sigmas, minus 1
-        a, tau, da, dq = self.decay, self.levels.correlation_time, self.da, self.dq
+        a, tau = self.decay, self.levels.correlation_time
+        da, dq = self.decay_by_time, self.log_variance_by_time
         score = float((product * da / self.noise_variance + excess * dq / 2).sum()
                       + begin.sum() / 2 - np.log(tau / USUAL_TIME) / TIME_SPREAD**2)
         information = 3 * float((da**2 / (1 - a**2) + dq**2 / 2).sum() + 0.5) + TIME_SPREAD**-2
@@ -158,11 +159,11 @@ class SlowError(factor.Factor):
     def _by_time(self) -> Floats:
         """Return minus the derivative of ``_precision`` by the log correlation time: (N, 3)."""
         s, r = self.state.slow_n, self.residual()
-        noise = (self.da * s[:-1] + r * self.dq) / self.noise_variance
+        noise = (self.decay_by_time * s[:-1] + r * self.log_variance_by_time) / self.noise_variance
         out = np.zeros_like(s)
         out[0] = s[0] / self.variance
         out[1:] += noise
-        out[:-1] += self.da * r / self.noise_variance - self.decay * noise
+        out[:-1] += self.decay_by_time * r / self.noise_variance - self.decay * noise
         return out
 
     def _process(self, g: Floats) -> Floats:
