@@ -1,14 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result folders that are read-only or shared, and nodes that end: complete files."""
+"""Result folders that are read-only, and nodes that end: complete files."""
 
 import json
 from pathlib import Path
 import signal
 import time
 
-from bench import answer_of, wait_for
+from bench import wait_for
 from kills import drive, killed_at_files, LAST_S, SCALE, START_S, whole_content, wrong
 import numpy as np
 from player import Drive, messages_of, within
@@ -32,21 +32,12 @@ def driven():
     return drive()
 
 
-def leg(driven, nodes, clients):
-    """Drive a leg for nodes with the same topics; check that each succeeds."""
-    drives = [Drive(*one, driven, SPEED) for one in zip(nodes, clients, strict=True)]
-    first = drives[0]
-    wait_for(lambda: all(p.get_subscription_count() == len(clients)
-                         for p in first.player.publishers.values()), 'subscriptions')
-    first.play(30, START_S)
-    for client in clients:
-        client.until(state='idle')
-        client.start()
-    first.play(START_S, LAST_S)
-    calls = [client.ask('stop_leg') for client in clients]
-    first.play(LAST_S, LAST_S + 2)
-    answers = [client.result(one) for client, one in zip(clients, calls, strict=True)]
-    assert all(answer.success for answer in answers), answers
+def drive_leg(driven, node, client):
+    """Drive a leg; check that it succeeds."""
+    drive = Drive(node, client, driven, SPEED)
+    drive.record(30, START_S, LAST_S)
+    answer = drive.ended(LAST_S)
+    assert answer.success, answer.message
 
 
 def true(content):
@@ -64,7 +55,7 @@ def test_a_read_only_folder_is_reported_and_used_once_it_is_writable(
     folder.chmod(0o555)
     node = start({'output.directory': folder} | QUICK, before=OBEY)
     client = connect()
-    leg(driven, [node], [client])
+    drive_leg(driven, node, client)
     status = wait_for(lambda: client.status['save_error'] and client.status, 'the warning')
     assert 'Permission denied' in status['save_error']
     assert str(folder) in status['save_error']
@@ -95,28 +86,6 @@ def test_a_read_only_folder_is_reported_and_used_once_it_is_writable(
     assert true(whole_content(other))
     assert len(results(folder)) == 1
     assert node.process.poll() is None
-
-
-def test_two_nodes_that_save_into_one_folder_have_a_result_each(
-        start, connect, driven, tmp_path):
-    names = ('first', 'second')
-    nodes = [start({'output.formats': '[params, transform]'} | QUICK, '-r', f'__node:={name}')
-             for name in names]
-    clients = [connect(name) for name in names]
-    leg(driven, nodes, clients)
-    answers = [answer_of(one) for one in [
-        client.ask('save') for client in clients for _ in range(3)]]
-    assert all(answer.success for answer in answers), answers
-    folders = results(tmp_path)
-    assert len(folders) == 8              # with the automatic saves
-    assert all(true(whole_content(one)) for one in folders)
-    assert (tmp_path / 'latest').resolve() in folders
-    for client in clients:
-        assert Path(client.status['saved']) in folders
-    journals = {client.status['journal'] for client in clients}
-    assert len(journals) == len(list((tmp_path / 'journal').iterdir())) == 2
-    assert not list(tmp_path.rglob('.*.part'))
-    assert all(node.end() == 0 for node in nodes)
 
 
 @pytest.fixture(scope='module')
