@@ -288,6 +288,11 @@ def cautions(reasons: Iterable['Reason']) -> list['Reason']:
     return [r for r in most_severe_first(reasons) if r.code.severity is not NOTE]
 
 
+def rejecting(reasons: Iterable['Reason']) -> list['Reason']:
+    """Return the reasons that reject a leg, a method or a calibration."""
+    return [reason for reason in reasons if reason.code.severity is Verdict.REJECTED]
+
+
 def verdict_of(reasons: Iterable['Reason']) -> Verdict:
     """Return the most severe verdict of the reasons."""
     return Verdict.worst(r.code.severity for r in reasons)

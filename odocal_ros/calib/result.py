@@ -146,6 +146,11 @@ class LegResult:
                    default=Verdict.REJECTED)
         return Verdict.worst([verdict_of(self.reasons), best])
 
+    @property
+    def all_reasons(self) -> tuple[Reason, ...]:
+        """Return the reasons of the leg and of its methods."""
+        return self.reasons + tuple(r for m in self.methods.values() for r in m.reasons)
+
     def without_plot_data(self) -> 'LegResult':
         """Return the data for a combination and its tables."""
         methods = {name: replace(method, details={

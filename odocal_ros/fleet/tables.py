@@ -23,7 +23,6 @@ from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import legs_from_text, Row
 from odocal_ros.fleet.statistics import MODEL_OUTLIER_SIGMAS, population
 from odocal_ros.output.value_text import MAIN_VALUES, UNKNOWN
-from odocal_ros.reasons import Reason
 from odocal_ros.safe_io.atomic_files import locked, whole_file
 from odocal_ros.safe_io.text_formats import one_line
 
@@ -33,12 +32,6 @@ WORST_FIRST = ('FAIL', 'UNDECIDED', 'rejected', 'caution', 'PASS', 'accepted')
 VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in VALUES)
 
 
-def all_reasons(leg: LegResult) -> list[Reason]:
-    """Return the reasons of a leg and of its methods."""
-    return [*leg.reasons, *(reason for method in leg.methods.values()
-                            for reason in method.reasons)]
-
-
 def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
             leg: LegResult) -> dict[str, Any]:
     """Return the row of a leg; number : of the leg in its vehicle or bag, from 1."""
@@ -46,7 +39,7 @@ def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
            'odometer_km': odometer_km, 'start': utc(leg.start_ns), 'start_ns': leg.start_ns,
            'stop_ns': leg.stop_ns, 'duration_s': leg.duration, 'distance_m': leg.distance,
            'fixes': leg.fixes, 'verdict': leg.verdict.value,
-           'reasons': ' '.join(dict.fromkeys(r.code.name for r in all_reasons(leg)))}
+           'reasons': ' '.join(dict.fromkeys(reason.code.name for reason in leg.all_reasons))}
     return row | value_cells(leg_estimates(leg))
 
 

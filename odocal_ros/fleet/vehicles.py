@@ -24,14 +24,14 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import DONE, legs_from_text, read_rows, Row
 from odocal_ros.fleet.statistics import covariance, History, history
-from odocal_ros.fleet.tables import all_reasons, leg_row, utc, value_cells
+from odocal_ros.fleet.tables import leg_row, utc, value_cells
 from odocal_ros.library.calibrate_bag import unique_names
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.output.stored import known_imu
 from odocal_ros.output.value_text import accept_line, iso, MAIN_VALUES, UNKNOWN
 from odocal_ros.pipeline.acceptance import accept, Decision
 from odocal_ros.pipeline.calibrate import combine
-from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.reasons import Reason, rejecting, Verdict
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.levels import DAY_NS
 
@@ -117,8 +117,7 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
 
 def rejecting_reasons(leg: LegResult) -> list[Reason]:
     """Return the reasons that reject a leg, empty if it is not rejected."""
-    return [reason for reason in all_reasons(leg) if leg.verdict is Verdict.REJECTED
-            and reason.code.severity is Verdict.REJECTED]
+    return rejecting(leg.all_reasons) if leg.verdict is Verdict.REJECTED else []
 
 
 def rejected_state_reason(rejected: Sequence[DrivenLeg]) -> Reason:

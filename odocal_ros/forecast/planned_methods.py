@@ -39,7 +39,7 @@ from odocal_ros.nav.geodesy import earth_rate_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose
 from odocal_ros.nav.time_series import running_integral
-from odocal_ros.reasons import Code, Reason, Verdict, verdict_of
+from odocal_ros.reasons import Code, Reason, rejecting, Verdict, verdict_of
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import grade_of
 
@@ -274,8 +274,7 @@ class Plan:
                 relevant = tuple(reason for reason in self.reasons_of(name) if reason in relevant
                                  or reason.code.name.endswith('_NOT_DETERMINED'))
             elif name not in self.methods_used:
-                relevant = tuple(reason for reason in relevant
-                                 if reason.code.severity is Verdict.REJECTED)
+                relevant = tuple(rejecting(relevant))
             reasons += [reason for reason in relevant if reason not in reasons]
         return tuple(reasons)
 

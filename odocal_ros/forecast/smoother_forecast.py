@@ -32,7 +32,7 @@ from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.pipeline.calibrate import PROVISIONAL_CODES
 from odocal_ros.pipeline.planar_run import planar_leg
 from odocal_ros.pipeline.prepared_leg import Stage
-from odocal_ros.reasons import Code, Verdict
+from odocal_ros.reasons import Code, rejecting, Verdict
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config
 
@@ -79,10 +79,10 @@ def without_accelerometer_values(forecast: Forecast) -> Forecast:
 def add_running_estimate(forecast: Forecast, running: RunningEstimate, config: Config) -> Forecast:
     """Return a forecast with the running estimate for the values that it will give."""
     method = running.method
-    faults = [reason for reason in method.reasons if reason.code.severity is Verdict.REJECTED
-              and reason.code not in REASON_ESTIMATES]
+    faults = tuple(reason for reason in rejecting(method.reasons)
+                   if reason.code not in REASON_ESTIMATES)
     if faults:      # its values are useless then
-        return replace(forecast, faults=tuple(faults))
+        return replace(forecast, faults=faults)
     if method.verdict is not Verdict.REJECTED:
         forecast = replace(forecast, methods=forecast.methods | {'smoother': method})
     estimates, _ = choose(forecast.methods, config.method)
@@ -175,9 +175,8 @@ def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> 
     method = result.methods[PLANAR]
     if result.track_n is None:
         raise BadData(method.reasons[0].text)
-    faults = tuple(reason for reason in (*result.reasons, *method.reasons)
-                   if reason.code.severity is Verdict.REJECTED
-                   and reason.code not in {*REASON_ESTIMATES, *TEMPORARY_CODES})
+    faults = tuple(reason for reason in rejecting((*result.reasons, *method.reasons))
+                   if reason.code not in {*REASON_ESTIMATES, *TEMPORARY_CODES})
     estimates, _ = choose(result.methods, config.method)
     return Forecast(
         _planar_scale(result, config.verdict.max_scale_sigma),

@@ -16,7 +16,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.number_text import significant
 from odocal_ros.output import value_text as texts
 from odocal_ros.pipeline.combination import overlapping_legs
-from odocal_ros.reasons import Verdict, verdict_of
+from odocal_ros.reasons import rejecting, Verdict, verdict_of
 from odocal_ros.safe_io.text_formats import for_table
 from odocal_ros.settings.config import Config
 
@@ -145,9 +145,8 @@ def method_lines(calibration: result.Calibration) -> list[str]:
 
 def _rejection_text(method: result.MethodResult) -> str:
     """Return ': CODE', the first code for which a method is rejected, '' if it is not."""
-    codes = [reason.code.name for reason in method.reasons
-             if reason.code.severity is Verdict.REJECTED]
-    return f': {codes[0]}' if codes else ''
+    reasons = rejecting(method.reasons)
+    return f': {reasons[0].code.name}' if reasons else ''
 
 
 def leg_verdicts(legs: tuple[result.LegResult, ...]) -> list[str]:

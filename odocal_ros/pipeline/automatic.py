@@ -21,7 +21,7 @@ from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, Samples
 from odocal_ros.pipeline.combination import combine
-from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.reasons import Code, Reason, rejecting, Verdict
 from odocal_ros.screening.odometer_rows import StepReader
 from odocal_ros.settings.config import Config
 
@@ -161,9 +161,7 @@ def rejecting_reason(result: LegResult) -> Reason | None:
     """Return the rejecting reason of a dropped automatic leg, None if it is kept."""
     if result.verdict is not Verdict.REJECTED:
         return None
-    all_reasons = (*result.reasons, *(reason for method in result.methods.values()
-                                      for reason in method.reasons))
-    return next((reason for reason in all_reasons if reason.code.severity is Verdict.REJECTED),
+    return next(iter(rejecting(result.all_reasons)),
                 Reason(Code.NO_METHOD, 'no method could be run'))
 
 

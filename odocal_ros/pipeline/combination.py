@@ -5,6 +5,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 import math
 from typing import NamedTuple
 
@@ -23,7 +24,7 @@ from odocal_ros.calib.result import (
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix, wrap
-from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.reasons import Code, Reason, rejecting, Verdict
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, TYRE_SPREAD
 from odocal_ros.settings.nominal import nominal_scale
@@ -79,8 +80,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     if len(usable) < config.verdict.min_legs and usable:
         reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(usable)} usable leg'
                               f'{"s" * (len(usable) > 1)}; required: {config.verdict.min_legs}'))
-    if not estimating_methods and not any(
-            reason.code.severity is Verdict.REJECTED for reason in reasons):
+    if not estimating_methods and not rejecting(reasons):
         reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy,
@@ -90,10 +90,10 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
 def _join_reasons(reasons: Sequence[Reason], further: Sequence[Reason]) -> list[Reason]:
     """Return reasons, and further ones that are not known and whose code does not reject yet."""
     known = {(reason.code, reason.text) for reason in reasons}
-    rejecting = {reason.code for reason in reasons if reason.code.severity is Verdict.REJECTED}
+    rejecting_codes = {reason.code for reason in rejecting(reasons)}
     return list(dict.fromkeys([*reasons, *(
         reason for reason in further
-        if (reason.code, reason.text) not in known and reason.code not in rejecting)]))
+        if (reason.code, reason.text) not in known and reason.code not in rejecting_codes)]))
 
 
 def _precedes(carried: CarriedInformation, legs: Sequence[LegResult]) -> bool:
@@ -163,8 +163,7 @@ def _combine_method(name: str, leg_results: Sequence[tuple[MethodResult, int, in
                                carried if usable else None, local)
     if usable or len(results) == 1:
         return combined
-    rejections = dict.fromkeys(reason for result in results for reason in result.reasons
-                               if reason.code.severity is Verdict.REJECTED)
+    rejections = dict.fromkeys(rejecting(chain(*(result.reasons for result in results))))
     return replace(combined, reasons=(*combined.reasons, *rejections))
 
 
@@ -207,14 +206,13 @@ def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
 
 def _additional_reasons(method: MethodResult, leg: LegResult) -> list[Reason]:
     """Return a method's reasons, except those whose code already rejects the leg."""
-    known = {reason.code for reason in leg.reasons if reason.code.severity is Verdict.REJECTED}
+    known = {reason.code for reason in rejecting(leg.reasons)}
     return [reason for reason in method.reasons if reason.code not in known]
 
 
 def _rejection_text(reasons: Sequence[Reason]) -> str:
     """Return the texts of the rejecting reasons."""
-    return '; '.join(dict.fromkeys(reason.text for reason in reasons
-                                   if reason.code.severity is Verdict.REJECTED))
+    return '; '.join(dict.fromkeys(reason.text for reason in rejecting(reasons)))
 
 
 def _imu_rotation(estimates: Mapping[str, Estimate], C_bi: Floats | None,
