@@ -92,15 +92,13 @@ def _noise_integral(r: Floats, dt: Floats) -> Floats:
     """Return the integral of [r x][r x]^T over time, (3, 3) m^2 s: the effect of white noise."""
     mid = (r[:-1] + r[1:]) / 2
     outer = np.einsum('ni,nj,n->ij', mid, mid, dt)
-    integral: Floats = np.trace(outer) * np.eye(3) - outer
-    return integral
+    return np.asarray(np.trace(outer) * np.eye(3) - outer)
 
 
 def root_of(covariance: Floats) -> Floats:
     """Return a square root of a covariance that may be singular: A A^T = covariance."""
     value, vector = np.linalg.eigh(covariance)
-    root: Floats = vector * np.sqrt(np.maximum(value, 0.0))
-    return root
+    return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
 
 
 def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
@@ -114,18 +112,16 @@ def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start:
 
     middle, change = map(np.ascontiguousarray, map_windows(middle_and_change, q_nb).swapaxes(0, 1))
     speed = np.einsum('ni,ni->n', middle, np.diff(D, axis=0)) / (f @ f) / np.diff(t)
-    effect: Floats = (change * speed[:, None]).sum(axis=0)
+    effect = (change * speed[:, None]).sum(axis=0)
     v_start = 0.0 if start.standing else _velocity(t, D, start.t, min(start.t + 1.0, end.t))
     v_end = 0.0 if end.standing else _velocity(t, D, max(end.t - 1.0, start.t), end.t)
-    effect -= v_end - v_start
-    return effect
+    return np.asarray(effect - (v_end - v_start))
 
 
 def _velocity(t: Floats, D: Floats, begin: float, end: float) -> Floats:
     """Return the mean velocity between two times, (3,) m/s."""
     ends = np.stack([np.interp([begin, end], t, D[:, k]) for k in range(3)], -1)
-    mean: Floats = (ends[1] - ends[0]) / max(end - begin, 1e-9)
-    return mean
+    return np.asarray((ends[1] - ends[0]) / max(end - begin, 1e-9))
 
 
 def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Floats, q_nb: Floats,

@@ -133,8 +133,7 @@ def _weights(covariance: Floats) -> Floats:
     from scipy.optimize import nnls
     root = np.linalg.cholesky(covariance / np.trace(covariance))
     weight, _ = nnls(root.T, np.linalg.solve(root, np.ones(len(root))))
-    normalised: Floats = weight / weight.sum()
-    return normalised
+    return np.asarray(weight / weight.sum())
 
 
 def _scale_ratio(results: Sequence[MethodResult],

@@ -73,8 +73,8 @@ def rate_over_second(t: Floats, x: Floats) -> Floats:
     if len(t) < 2:
         return np.zeros(len(t))
     low, high = np.maximum(t - 0.5, t[0]), np.minimum(t + 0.5, t[-1])
-    rate: Floats = (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-9)
-    return rate
+    change = np.interp(high, t, x) - np.interp(low, t, x)
+    return np.asarray(change / np.maximum(high - low, 1e-9))
 
 
 def odometer_span_reasons(travel: Travel, t_stop: float) -> tuple[Reason, ...]:

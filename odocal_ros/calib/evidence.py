@@ -155,8 +155,7 @@ def _forward_directions(t_new: Floats, t: Floats, track_n: Floats, sign: Floats)
         return np.ones(len(t_new), complex)
     last_moving = np.searchsorted(moving, np.arange(len(t)), side='right') - 1
     angle = np.unwrap(np.angle(velocity[moving[np.maximum(last_moving, 0)]]))
-    directions: Complexes = np.exp(1j * np.interp(t_new, t, angle))
-    return directions
+    return np.asarray(np.exp(1j * np.interp(t_new, t, angle)))
 
 
 def _along_and_across(offset_n: Floats, forward: Complexes) -> Floats:

@@ -94,8 +94,7 @@ def fit_jointly(marginals: Sequence[MarginalInformation], steps: Sequence[float]
 def normal_deviate(chi2: float, freedom: float) -> float:
     """Return the normal deviate of a chi-square (Wilson and Hilferty 1931)."""
     variance = 2 / (9 * freedom)
-    deviate: float = ((max(chi2, 0.0) / freedom)**(1 / 3) - (1 - variance)) / np.sqrt(variance)
-    return deviate
+    return float(((max(chi2, 0.0) / freedom)**(1 / 3) - (1 - variance)) / np.sqrt(variance))
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,8 +71,7 @@ def _inliers(position_n: Floats, covariance_n: Floats) -> Bools:
     sigma = max(np.median(horizontal) / RAYLEIGH_MEDIAN,
                 0.2 * np.sqrt((stated[0] + stated[1]) / 2))
     sigma_up = max(np.median(up) / NORMAL_MEDIAN, 0.2 * np.sqrt(stated[2]))
-    inliers: Bools = (horizontal <= OUTLIER_SIGMAS * sigma) & (up <= OUTLIER_SIGMAS * sigma_up)
-    return inliers
+    return np.asarray((horizontal <= OUTLIER_SIGMAS * sigma) & (up <= OUTLIER_SIGMAS * sigma_up))
 
 
 def _variance_share(t: Floats, residual: Floats, fix_covariance: Floats, weight: Floats,
@@ -98,8 +97,7 @@ def _variance_share(t: Floats, residual: Floats, fix_covariance: Floats, weight:
     fast = min(half_square_step, 1.0)
     slow = max(1.0, scatter) - fast
     tau = _correlation_time(t, z, fast, slow)
-    share: float = fast * white + slow * _mean_variance_share(t, weight, tau)
-    return share
+    return float(fast * white + slow * _mean_variance_share(t, weight, tau))
 
 
 def _mean_variance_share(t: Floats, weight: Floats, tau: float) -> float:

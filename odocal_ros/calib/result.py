@@ -102,7 +102,7 @@ class PerDistance:
     length: float  # m driven
     before: float
     after: float
-    pieces: float  # path length over ``length``
+    pieces: float  # number of pieces of this length in the path
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +183,9 @@ def has_local_positions(legs: Iterable[LegResult]) -> bool:
     return any(reason.code is Code.LOCAL_FRAME for leg in legs for reason in leg.reasons)
 
 
-def name_antenna(words: str, local: bool) -> str:
-    """Return words about the antenna; with positions in a local frame it is a tracked point."""
-    return words.replace('antenna', 'tracked point') if local else words
+def name_antenna(text: str, is_local: bool) -> str:
+    """Return a text about the antenna; with positions in a local frame it is a tracked point."""
+    return text.replace('antenna', 'tracked point') if is_local else text
 
 
 def raise_on_overflow() -> np.errstate:
@@ -193,14 +193,14 @@ def raise_on_overflow() -> np.errstate:
     return np.errstate(over='raise', divide='raise', invalid='raise')
 
 
-def failed(unknown: Callable[[Reason], MethodResult], name: str, error: Exception) -> MethodResult:
-    """Return the result of a method that raised: no values, the reason, and the trace."""
-    where = traceback.extract_tb(error.__traceback__)[-1]
+def failed(refuse: Callable[[Reason], MethodResult], name: str, error: Exception) -> MethodResult:
+    """Return the result of a method that raised; refuse: makes its result without values."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
     text = ' '.join(str(error).split())[:200]
     reason = Reason(Code.METHOD_FAILED, f'method {name} failed with an internal error: '
-                    f'{type(error).__name__}{f" ({text})" if text else ""} in {where.name}, line '
-                    f'{where.lineno}')
-    return replace(unknown(reason), details={TRACE: ''.join(traceback.format_exception(error))})
+                    f'{type(error).__name__}{f" ({text})" if text else ""} in {place.name}, line '
+                    f'{place.lineno}')
+    return replace(refuse(reason), details={TRACE: ''.join(traceback.format_exception(error))})
 
 
 def traces(legs: Iterable[LegResult]) -> Iterator[tuple[str, str]]:

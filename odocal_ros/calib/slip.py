@@ -126,8 +126,7 @@ def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward
     along = map_rows(lambda f_b: f_b @ forward, f_b)
     force = np.diff(integral_at(grid, t_imu, along)) / SPIN_GRID
     rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
-    mean: Floats = force - gravity(latitude, 0.0) * rise
-    return mean
+    return np.asarray(force - gravity(latitude, 0.0) * rise)
 
 
 def excess_path(span: int, a: Floats, path: Floats) -> Floats:

@@ -114,8 +114,7 @@ def _without_slope(pair: WheelPair, residual: Floats, quantum_m: float) -> Float
     slope = np.median(rise[moves] / distance[moves]) if moves.any() else 0.0
     # a slope that rounding can cause at a steady speed, two counts over a window, is not removed
     rounding_slope = 2 * quantum_m * (pair.quantum > 0) / max(np.median(distance), 1e-9)
-    corrected: Floats = residual - np.sign(slope) * max(abs(slope) - rounding_slope, 0.0) * path
-    return corrected
+    return np.asarray(residual - np.sign(slope) * max(abs(slope) - rounding_slope, 0.0) * path)
 
 
 def _without_slips(pair: WheelPair, events: list[Event]) -> WheelPair:
@@ -175,8 +174,7 @@ def _is_finished(pair: WheelPair, residual: Floats, event: Event) -> bool:
 def _slope(pair: WheelPair, event: Event) -> float:
     """Return the size of a slip per path length, from a tenth to nine tenths of its size."""
     begin, end = np.interp([event.begin, event.end], pair.t, _mean_path(pair))
-    slope: float = 0.8 * event.size / max(end - begin, 1e-9)
-    return slope
+    return float(0.8 * event.size / max(end - begin, 1e-9))
 
 
 def _mean_path(pair: WheelPair) -> Floats:

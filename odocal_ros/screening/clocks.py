@@ -96,8 +96,7 @@ def _stamped(samples: SomeSamples) -> SomeSamples:
 
 def _lag(samples: Samples) -> Floats:
     """Return arrival minus stamp, s: (n,)."""
-    lag: Floats = np.multiply(samples.received_ns - samples.stamp_ns, 1e-9)
-    return lag
+    return np.asarray((samples.received_ns - samples.stamp_ns) * 1e-9)
 
 
 def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
@@ -105,8 +104,7 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
     base = imu.received_ns[0]
 
     def seconds(received_ns: Ints) -> Floats:
-        since_first: Floats = np.multiply(received_ns - base, 1e-9)
-        return since_first
+        return np.asarray((received_ns - base) * 1e-9)
 
     if not map_windows(lambda ns: np.diff(seconds(ns)) > 0, imu.received_ns).all():
         # queued messages arrive together: their mean is used
@@ -201,8 +199,8 @@ def _chords(position: Floats) -> Floats:
     cells = round(ACCELERATION_S / OFFSET_CELL)
     total = np.cumsum(np.pad(position, ((cells, cells), (0, 0)), mode='edge'), axis=0)
     window_sum = total[cells:] - total[:-cells]
-    chords: Floats = np.linalg.norm(window_sum[cells:] - window_sum[:-cells], axis=1)[:, None]
-    return chords
+    difference = window_sum[cells:] - window_sum[:-cells]
+    return np.asarray(np.linalg.norm(difference, axis=1, keepdims=True))
 
 
 def _without_slow_changes(x: Floats, slow: float) -> Floats:

@@ -108,8 +108,7 @@ def has_position(fix: FixSamples) -> Bools:
     """Return a mask of fixes on the Earth, not NaN, whose angles are not both zero: (n,) bool."""
     both_zero = (fix.latitude == 0) & (fix.longitude == 0)
     inside = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi)
-    on_earth: Bools = inside & ~both_zero
-    return on_earth
+    return np.asarray(inside & ~both_zero)
 
 
 def _far_from_median(fix: FixSamples, good: Bools) -> Bools:
@@ -285,8 +284,7 @@ def _without_delay(deviation: Complexes, delay_rate: Complexes) -> Floats:
     order = np.argsort(delays)
     weight = np.cumsum(size[order])
     delay = delays[order[np.searchsorted(weight, weight[-1] / 2)]]    # weighted median
-    remaining: Floats = np.abs(deviation - delay * delay_rate * (abs(delay) > JUMP_DELAY))
-    return remaining
+    return np.asarray(np.abs(deviation - delay * delay_rate * (abs(delay) > JUMP_DELAY)))
 
 
 def _smooth_begin(smooth: Bools) -> int:

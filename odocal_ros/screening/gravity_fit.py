@@ -119,8 +119,7 @@ def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, 
         np.abs(cut((speed[1:] + speed[:-1]) / 2)).mean(axis=1) > MOVING_SPEED)
 
     def without_offsets(x: Complexes) -> Complexes:
-        residual: Complexes = (x - basis @ (basis.conj().swapaxes(1, 2) @ x))[use]
-        return residual
+        return np.asarray((x - basis @ (basis.conj().swapaxes(1, 2) @ x))[use])
     return without_offsets(regressors), without_offsets(cut(force)[..., None])[..., 0]
 
 
@@ -162,5 +161,4 @@ def _integral(rate: Complexes) -> Complexes:
 
 
 def _means_of_seconds(x: NDArray[Any]) -> Complexes:
-    mean: Complexes = x.reshape(-1, ROWS_A_SECOND).mean(axis=1)
-    return mean
+    return np.asarray(x.reshape(-1, ROWS_A_SECOND).mean(axis=1))

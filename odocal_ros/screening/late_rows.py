@@ -101,8 +101,7 @@ def _correct_bursts(t: Floats, travel: Floats, rounding: float) -> Floats:
 def _rising(t: Floats) -> Floats:
     """Return strictly rising times: each at least MIN_STEP after the previous one."""
     order = MIN_STEP * np.arange(len(t))
-    rising: Floats = np.maximum.accumulate(t - order) + order
-    return rising
+    return np.asarray(np.maximum.accumulate(t - order) + order)
 
 
 def _late_runs(t: Floats, even: Floats, travel: Floats, late: Bools,
@@ -225,8 +224,7 @@ def _times_by_travel(t: Floats, travel: Floats, before: int, after: int,
 
     def speed(first: int, last: int) -> float:
         first, last = max(first, 0), min(last, len(t) - 1)
-        size: float = abs(travel[last] - travel[first]) / max(t[last] - t[first], interval / 10)
-        return size
+        return float(abs(travel[last] - travel[first]) / max(t[last] - t[first], interval / 10))
 
     adjacent = max(speed(before - NODE_STEP, before), speed(after, after + NODE_STEP))
     max_duration = 1.0    # s within which speed is almost constant

@@ -43,9 +43,10 @@ def rounding_variance(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, t
     latitude = float(np.median(geodetic[:, 0]))
     meridian, normal = radii(latitude)
     sizes = steps * (normal * np.cos(latitude), meridian)
-    for axis, cell in enumerate(np.rint((angles - angles[0]) / steps).T):
-        equal = np.diff(np.flatnonzero(np.diff(cell, prepend=np.nan)), append=n)
-        variance[:, axis] = np.repeat(equal, equal) * sizes[axis]**2 / 12
+    for axis, coordinate in enumerate(np.rint((angles - angles[0]) / steps).T):     # in steps
+        first_equal = np.flatnonzero(np.diff(coordinate, prepend=np.nan))
+        count = np.diff(first_equal, append=n)      # of consecutive fixes with equal coordinates
+        variance[:, axis] = np.repeat(count, count) * sizes[axis]**2 / 12
     stated = np.sqrt(np.median(covariance_n.diagonal(axis1=1, axis2=2), axis=0)[:2])
     factor = float(np.hypot(1.0, sizes / np.sqrt(12) / stated).max())
     if factor <= FIX_NOISE_LIMIT:
@@ -59,16 +60,16 @@ def rounding_variance(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, t
 
 
 def common_step(angle: Floats) -> float:
-    """Return the greatest common divisor of differences of values, (n,) rad; 0: none."""
+    """Return the greatest common divisor of differences of angles, (n,) rad; 0: none (Euclid)."""
     differences = np.diff(np.unique(angle))
     differences = differences[differences > FINEST_ANGLE]
     if len(differences) < MIN_DIFFERENCES:
         return 0.0
     step = float(differences.min())
     while step > FINEST_ANGLE:
-        rest = abs(differences - step * np.rint(differences / step))
-        rest = rest[rest > OFF_GRID * step]
-        if not len(rest):
+        remainder = abs(differences - step * np.rint(differences / step))
+        remainder = remainder[remainder > OFF_GRID * step]
+        if not len(remainder):
             return step
-        step = float(rest.min())
+        step = float(remainder.min())
     return 0.0

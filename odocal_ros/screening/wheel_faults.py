@@ -47,8 +47,7 @@ class WheelPair:
     @property
     def step(self) -> float:
         """Return the length of a cell, s."""
-        length: float = self.t[1] - self.t[0]
-        return length
+        return float(self.t[1] - self.t[0])
 
     def min_sigma(self, steps: Floats) -> float:
         """Return the least sigma of travel in cells: rounding, and a part of their median."""

@@ -137,8 +137,7 @@ class _Alignment:
     def _sums(self, x: NDArray[Any]) -> NDArray[Any]:
         """Return the sums over each window, along the last axis."""
         total = _from_zero(x)
-        out: NDArray[Any] = total[..., self.windows[:, 1]] - total[..., self.windows[:, 0]]
-        return out
+        return np.asarray(total[..., self.windows[:, 1]] - total[..., self.windows[:, 0]])
 
 
 def _from_zero(steps: NDArray[Any]) -> NDArray[Any]:

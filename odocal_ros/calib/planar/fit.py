@@ -41,12 +41,12 @@ MAX_PASSES = 80
 LARGEST_LAST_STEP = 0.02
 
 
-def fit_run(run: Run, known: PriorKnowledge,
+def fit_run(run: Run, knowledge: PriorKnowledge,
             after_pass: Callable[[int, float], None] = lambda *_: None) -> Fit:
     """Return the estimate of a run; after_pass gets the pass and the largest step in sigmas."""
-    initial = first_values(run, known.width)
+    initial = first_values(run, knowledge.width)
     scale = (initial.left + initial.right) / 2
-    prior_mean, prior = priors(run, known, initial.left, initial.right, initial.width)
+    prior_mean, prior = priors(run, knowledge, initial.left, initial.right, initial.width)
     c, state = prior_mean.copy(), np.zeros((len(run.t), 5))
     state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis) for axis in run.position.T)
     state[:, 2] = initial.heading
@@ -55,7 +55,7 @@ def fit_run(run: Run, known: PriorKnowledge,
     first_gains = np.array([scale, scale, scale / initial.width])
     while passes < MAX_PASSES and not converged:
         passes += 1
-        rows = _rows(run, known, state, c, first_gains, student_weights)
+        rows = _rows(run, knowledge, state, c, first_gains, student_weights)
         equations = {name: Equations(r, len(state)) for name, r in rows.items()}
         solution = _solve(equations, levels, prior, np.einsum('ij,j->i', prior, c - prior_mean))
         residuals = {name: replace(r, value=_residuals_after_step(r, solution))
@@ -73,11 +73,11 @@ def fit_run(run: Run, known: PriorKnowledge,
         level_change = max(map(abs, level_steps.values()))
         converged = change < LARGEST_LAST_STEP and level_change < LARGEST_LAST_STEP
         after_pass(passes, change)
-    result = fit_at(run, known, state, c, levels, first_gains, prior, student_weights)
+    result = fit_at(run, knowledge, state, c, levels, first_gains, prior, student_weights)
     return replace(result, passes=passes, converged=converged, swapped=initial.swapped)
 
 
-def fit_at(run: Run, known: PriorKnowledge, state: Floats, c: Floats, levels: dict[str, float],
+def fit_at(run: Run, knowledge: PriorKnowledge, state: Floats, c: Floats, levels: dict[str, float],
            first_gains: Floats, prior: Floats, student_weights: dict[str, Floats]
            | None = None) -> Fit:
     """
@@ -90,7 +90,7 @@ def fit_at(run: Run, known: PriorKnowledge, state: Floats, c: Floats, levels: di
     even = {'white': np.ones(len(run.node)), 'drift': np.ones(len(state))}
     student_weights = {name: weight * (STUDENT_FREEDOM + 2) / (STUDENT_FREEDOM + 4) / weight.mean()
                        for name, weight in (student_weights or even).items()}
-    rows = _rows(run, known, state, c, first_gains, student_weights)
+    rows = _rows(run, knowledge, state, c, first_gains, student_weights)
     equations = {name: Equations(r, len(state)) for name, r in rows.items()}
     solution = _solve(equations, levels, prior, 0 * c)
     names = (*run.wheels.names, 'ahead', 'left_of', 'delay',
@@ -99,13 +99,14 @@ def fit_at(run: Run, known: PriorKnowledge, state: Floats, c: Floats, levels: di
                {name: float(np.sqrt(levels[name])) for name in ESTIMATED}, 0, True, False)
 
 
-def priors(run: Run, known: PriorKnowledge, left: float, right: float, width: float,
+def priors(run: Run, knowledge: PriorKnowledge, left: float, right: float, width: float,
            ) -> tuple[Floats, Floats]:
     """Return first values (m,) and prior information (m, m) of the constants."""
     wheel_values, covariance = run.wheels.prior(left, right, width)
-    others = [(known.offset[0], known.offset_sigma), (known.offset[1], known.offset_sigma),
-              (0.0, known.delay_sigma)]
-    others += [(0.0, known.gyro_scale_sigma), (0.0, known.gyro_bias_sigma)] * bool(len(run.gyro))
+    others = [*((value, knowledge.offset_sigma) for value in knowledge.offset),
+              (0.0, knowledge.delay_sigma)]
+    if len(run.gyro):
+        others += [(0.0, knowledge.gyro_scale_sigma), (0.0, knowledge.gyro_bias_sigma)]
     m = len(wheel_values)
     information = np.diag(np.append(np.ones(m), [sigma**-2.0 for _, sigma in others]))
     information[:m, :m] = np.linalg.inv(covariance)
@@ -127,10 +128,9 @@ def _solve(equations: dict[str, Equations], levels: dict[str, float], prior: Flo
 def _residuals_after_step(rows: Rows, solution: Solution) -> Floats:
     """Return the linearised residuals after a step: (n, q)."""
     step = np.append(solution.states, np.zeros((1, solution.states.shape[1])), axis=0)
-    residuals: Floats = (rows.value + (rows.by_state @ step[rows.node][:, :, None])[:, :, 0]
-                         + (rows.by_next @ step[rows.node + 1][:, :, None])[:, :, 0]
-                         + np.einsum('kqm,m->kq', rows.by_constants, solution.constants))
-    return residuals
+    return np.asarray(rows.value + (rows.by_state @ step[rows.node][:, :, None])[:, :, 0]
+                      + (rows.by_next @ step[rows.node + 1][:, :, None])[:, :, 0]
+                      + np.einsum('kqm,m->kq', rows.by_constants, solution.constants))
 
 
 def _level_steps(equations: dict[str, Equations], residuals: dict[str, Rows],
@@ -153,15 +153,16 @@ def _level_steps(equations: dict[str, Equations], residuals: dict[str, Rows],
     return steps
 
 
-def _rows(run: Run, known: PriorKnowledge, state: Floats, c: Floats, first_gains: Floats,
+def _rows(run: Run, knowledge: PriorKnowledge, state: Floats, c: Floats, first_gains: Floats,
           student_weights: dict[str, Floats]) -> dict[str, Rows]:
     """Return the residual rows of each level at a linearisation point."""
     path = noise_path(run, first_gains[0])
+    decay = path / knowledge.drift_length
     rows = _wheel_rows(run, state, c, path, first_gains) | {
-        'drift': _drift_rows(state, path / known.drift_length, len(c), student_weights['drift']),
+        'drift': _drift_rows(state, decay, len(c), student_weights['drift']),
         'white': _position_rows(run, state, c, student_weights['white'])}
     if len(run.gyro):
-        rows['gyro'] = _gyro_rows(run, known, state, c)
+        rows['gyro'] = _gyro_rows(run, knowledge, state, c)
     return rows
 
 
@@ -202,7 +203,7 @@ def _wheel_rows(run: Run, state: Floats, c: Floats, path: Floats, first_gains: F
         value, by_state, by_next, by_constants, weight))) for name, i, nodes in levels}
 
 
-def _gyro_rows(run: Run, known: PriorKnowledge, state: Floats, c: Floats) -> Rows:
+def _gyro_rows(run: Run, knowledge: PriorKnowledge, state: Floats, c: Floats) -> Rows:
     """Return rows of the gyro: turn between the states minus that by the gyro."""
     n, m = len(run.t) - 1, len(run.wheels.names)
     dt, by_constants, by_state = np.diff(run.t), np.zeros((n, 1, len(c))), np.zeros((n, 1, 5))
@@ -210,7 +211,7 @@ def _gyro_rows(run: Run, known: PriorKnowledge, state: Floats, c: Floats) -> Row
     by_constants[:, 0, m + 3], by_constants[:, 0, m + 4] = -run.gyro, dt
     value = np.diff(state[:, 2]) - run.gyro * (1 + c[m + 3]) + dt * c[m + 4]
     return Rows(np.arange(n), value[:, None], by_state, -by_state, by_constants,
-                1 / (known.gyro_noise**2 * dt[:, None]))
+                1 / (knowledge.gyro_noise**2 * dt[:, None]))
 
 
 def _drift_rows(state: Floats, decay_exponent: Floats, m: int, student_weights: Floats) -> Rows:

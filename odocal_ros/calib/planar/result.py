@@ -22,8 +22,8 @@ from odocal_ros.settings.config import Config, SIDES
 # sigma of 6 to 70 % of the width, or of 2.5 % of the scale
 SCALE_SIGMA_LIMIT, SIGMA_LIMIT = 0.02, 0.03
 ARC = 0.75      # definition: ``Wheels.straightness`` on a radius of twice the track width
-# 1 sigma, share of the change of the width from turns on the spot to that radius, since the
-# dependence on the radius is assumed. Judgement, measured: docs/decisions/0024
+# 1 sigma of the width there, since its dependence on the radius is an assumed law: share of its
+# change from turns on the spot to that radius. Judgement, measured: docs/decisions/0024
 WIDTH_LAW_SHARE, ARC_SIGMA_LIMIT = 0.15, 0.05
 LAW_SOURCE, FIT_SOURCE, SLOPES = 'width_by_radius', 'positions_and_wheel_noise', 'slopes'
 WHEEL_NOISE, NOISE_LIMIT = ('along', 'turn', 'spin'), 0.1     # m/sqrt(m), judgement: of slip

@@ -61,28 +61,25 @@ class Wheels:
     def body_by_wheel(self) -> Floats:
         """Return forward, left, and width times turn per metre of each wheel: (3, w)."""
         shares: Floats = self.rows / np.maximum((self.rows**2).sum(0), 1e-12)
-        by_wheel: Floats = (shares * np.array([1.0, 1.0, 2.0])).T
-        return by_wheel
+        return np.asarray((shares * np.array([1.0, 1.0, 2.0])).T)
 
     def body_motion(self, metres: Floats) -> Floats:
         """Return forward, left, and width times turn by metres of the wheels, (n, w): (n, 3)."""
         # not by BLAS: its last bits depend on the number of rows
-        motion: Floats = np.einsum('kw,iw->ki', metres, self.body_by_wheel)
-        return motion
+        return np.asarray(np.einsum('kw,iw->ki', metres, self.body_by_wheel))
 
     @property
     def path(self) -> Floats:
         """Return the path of a wheel, mean of both sides, plus sideways motion: (n,)."""
         forward, side, wheel_difference = self.body_motion(self.count).T
-        path: Floats = np.maximum(np.abs(forward), np.abs(wheel_difference) / 2) + np.abs(side)
-        return path
+        rolled = np.maximum(np.abs(forward), np.abs(wheel_difference) / 2)
+        return np.asarray(rolled + np.abs(side))
 
     @property
     def turns_on_spot(self) -> Bools:
         """Return True for intervals with more turn than travel: (n,)."""
         forward, side, wheel_difference = np.abs(self.body_motion(self.count)).T
-        turns_on_spot: Bools = wheel_difference > 2 * (forward + side)
-        return turns_on_spot
+        return np.asarray(wheel_difference > 2 * (forward + side))
 
     @property
     def straightness(self) -> Floats:

@@ -185,8 +185,7 @@ class _BoxSearch:
         if not allowed[k] or self.values[k] >= self.least:
             return np.zeros(len(self.q), bool)
         self.q, self.least = points[k], float(self.values[k])
-        at_end: Bools = self.grid[k] != 0
-        return at_end
+        return np.asarray(self.grid[k] != 0)
 
     def widen(self) -> bool:
         """Double the range where the minimum is on its edge; return False at the widest range."""

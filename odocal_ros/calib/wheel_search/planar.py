@@ -183,12 +183,11 @@ def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:
     to HUBER and linear beyond.
     """
     if not robust:
-        mean: Floats = d2.mean(axis=1)
-        return mean
+        return np.asarray(d2.mean(axis=1))
     z2 = d2 / np.maximum(sigma, MIN_SIGMA)**2
     tail = z2 > HUBER**2
-    mean = np.where(tail, 2 * HUBER * np.sqrt(np.where(tail, z2, 0.0)) - HUBER**2, z2).mean(axis=1)
-    return mean
+    huber = np.where(tail, 2 * HUBER * np.sqrt(np.where(tail, z2, 0.0)) - HUBER**2, z2)
+    return np.asarray(huber.mean(axis=1))
 
 
 def weights(d2: Floats, sigma: Floats, robust: bool) -> Floats:
