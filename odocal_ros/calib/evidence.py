@@ -103,10 +103,10 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
           config: Config) -> tuple[tuple[str, float, float], ...]:
     """Return the gaps of IMU and odometer while the vehicle moves: (which, begin, end)."""
     travel = inputs.travel
-    gaps = [('IMU', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
-    gaps += [('odometer', a, b) for a, b in gaps_in_rhythm(travel.t)
-             if travel.at(a) != travel.at(b)]      # some counters send nothing at rest
-    return tuple((name, float(a), float(b)) for name, a, b in gaps if a < span[1] and b > span[0])
+    gaps = [('IMU', *gap) for gap in gaps_longer(inputs.t_imu, config.leg.max_gap).tolist()]
+    gaps += [('odometer', begin, end) for begin, end in gaps_in_rhythm(travel.t).tolist()
+             if travel.at(begin) != travel.at(end)]      # some counters send nothing at rest
+    return tuple(gap for gap in gaps if gap[1] < span[1] and gap[2] > span[0])
 
 
 def _pin_path(path: Path, pin: MarkFix) -> Path:

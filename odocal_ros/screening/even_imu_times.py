@@ -60,7 +60,7 @@ class _EvenTimes:
         jump = np.abs(lateness[2:] - lateness[:-2]) > interval / 2
         for shift in range(3):
             self.lost[shift:shift + len(jump)] |= jump
-        lines = [self._line(lateness, a, b) for a, b in runs(~self.lost)]
+        lines = [self._line(lateness, first, end) for first, end in runs(~self.lost)]
         self.knots, self.lateness = np.concatenate([np.zeros((2, 0)), *lines], axis=1)
 
     def _mean_lateness(self, t: Floats) -> Floats:
@@ -72,17 +72,17 @@ class _EvenTimes:
             means.append(lateness[:, n // 10:n - n // 10].mean(axis=1))
         return np.concatenate(means)
 
-    def _line(self, lateness: Floats, first: int, last: int) -> Floats:
+    def _line(self, lateness: Floats, first: int, end: int) -> Floats:
         """Return knots and lateness of blocks without a loss: a line plus means of windows."""
-        blocks = np.arange(first, last)
+        blocks = np.arange(first, end)
         middle = (blocks + 0.5) * self.per_block
-        slope, start = np.polyfit(middle, lateness[first:last], 1) if len(blocks) > 1 \
+        slope, start = np.polyfit(middle, lateness[first:end], 1) if len(blocks) > 1 \
             else (0.0, lateness[first])
-        residual = lateness[first:last] - start - slope * middle
+        residual = lateness[first:end] - start - slope * middle
         windows = np.array_split(blocks - first, max(1, len(blocks) // WINDOW_BLOCKS))
         means = np.array([residual[window].mean() for window in windows])
         knots = np.array([first * self.per_block, *(middle[window].mean() for window in windows),
-                          last * self.per_block - 1])
+                          end * self.per_block - 1])
         return np.stack([knots, start + slope * knots + np.pad(means, 1, mode='edge')])
 
     def times_of(self, t: Floats, rows: Ints) -> Floats:

@@ -56,8 +56,8 @@ def _tenths(inputs: Inputs) -> tuple[Ints, Floats]:
     edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
     if not inputs.has_accelerometer or edges[1] < MIN_TENTH_ROWS:
         return edges[:0], np.empty((0, 3))
-    return edges, np.array([medians(inputs.f_b[a:b])
-                            for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    return edges, np.array([medians(inputs.f_b[begin:end])
+                            for begin, end in zip(edges[:-1], edges[1:], strict=True)])
 
 
 def unit_change_reasons(inputs: Inputs) -> tuple[Reason, ...]:
@@ -174,13 +174,13 @@ def _share_of_second_imu(x: Floats) -> float:
     blocks = odd_minus_even[:count * MEAN_ROWS].reshape(count, MEAN_ROWS, 3)
     difference = blocks.mean(axis=1)
     size = np.abs(difference).max(axis=1)
-    good = size <= OUTLIER_RATIO * np.median(size)
-    mean = x[1:count * MEAN_ROWS + 1].reshape(blocks.shape).mean(axis=1)[good]
+    usual = size <= OUTLIER_RATIO * np.median(size)
+    mean = x[1:count * MEAN_ROWS + 1].reshape(blocks.shape).mean(axis=1)[usual]
     # blocks of equal noise: one that tilts and vibrates more would dominate the fit
-    blocks, design = blocks[good], np.column_stack([np.ones(len(mean)), mean])
+    blocks, design = blocks[usual], np.column_stack([np.ones(len(mean)), mean])
     noise = np.sqrt((blocks**2).mean(axis=(1, 2)))
     noise = np.maximum(noise, np.median(noise) or 1.0)[:, None]
-    difference, design = difference[good] / noise, design / noise
+    difference, design = difference[usual] / noise, design / noise
     blocks = blocks / noise[:, None]
     freedom = len(difference) - design.shape[1]
     if freedom < MIN_MEANS // 2:

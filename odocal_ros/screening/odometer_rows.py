@@ -234,8 +234,8 @@ class StepReader:
 
     def read(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
         """Return travel, stamp, ns, and duration, s, from each valid row to the next."""
-        good = ~is_impossible('value', block.value)
-        stamps, values = block.stamp_ns[good], block.value[good]
+        is_valid = ~is_impossible('value', block.value)
+        stamps, values = block.stamp_ns[is_valid], block.value[is_valid]
         if self._last is not None:
             stamps = np.r_[self._last[0], stamps]
             values = np.r_[self._last[1], values]

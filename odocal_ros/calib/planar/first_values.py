@@ -142,6 +142,6 @@ class _Alignment:
 
 def _from_zero(steps: NDArray[Any]) -> NDArray[Any]:
     """Return the cumulative sums along the last axis, 0 first."""
-    out = np.zeros((*steps.shape[:-1], steps.shape[-1] + 1), steps.dtype)
-    np.cumsum(steps, axis=-1, out=out[..., 1:])
-    return out
+    sums = np.zeros((*steps.shape[:-1], steps.shape[-1] + 1), steps.dtype)
+    np.cumsum(steps, axis=-1, out=sums[..., 1:])
+    return sums

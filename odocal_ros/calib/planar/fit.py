@@ -230,9 +230,9 @@ def _position_rows(run: Run, state: Floats, c: Floats, student_weights: Floats) 
     """Return rows of the positions: tracked point, with its errors, minus measured position."""
     k, count, m = run.node, len(run.node), len(run.wheels.names)
     psi = state[k, 2]
-    (a, b, delay), cos, sin = c[m:m + 3], np.cos(psi), np.sin(psi)
+    (ahead, left, delay), cos, sin = c[m:m + 3], np.cos(psi), np.sin(psi)
     speed = np.gradient(state[:, :2], run.t, axis=0)[k]
-    arm = np.stack([cos * a - sin * b, sin * a + cos * b], -1)
+    arm = np.stack([cos * ahead - sin * left, sin * ahead + cos * left], -1)
     value = (state[k, :2] + arm + state[k, 3:] - delay * speed) - run.position
     by_state, by_constants = np.zeros((count, 2, 5)), np.zeros((count, 2, len(c)))
     by_state[:, 0, 0] = by_state[:, 1, 1] = by_state[:, 0, 3] = by_state[:, 1, 4] = 1.0

@@ -82,8 +82,8 @@ def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats)
         free = np.array([side is None for side in face])
         y = np.array([0.0 if side is None else side[k] for k, side in enumerate(face)])
         if free.any():
-            rest = gradient[free] + hessian[np.ix_(free, ~free)] @ y[~free]
-            y[free] = np.linalg.lstsq(hessian[np.ix_(free, free)], -rest, rcond=1e-15)[0]
+            slope = gradient[free] + hessian[np.ix_(free, ~free)] @ y[~free]
+            y[free] = np.linalg.lstsq(hessian[np.ix_(free, free)], -slope, rcond=1e-15)[0]
             if (y < low).any() or (y > high).any():
                 continue
         value = gradient @ y + y @ hessian @ y / 2

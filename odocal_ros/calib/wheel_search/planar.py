@@ -200,10 +200,10 @@ def weights(d2: Floats, sigma: Floats, robust: bool) -> Floats:
 
 def course_differences(leg: PlanarLeg, sets: Floats) -> Floats:
     """Return the direction of dead-reckoned pieces minus that by the fixes, rad: (m, c)."""
-    a, b = leg.pieces.T
+    first, last = leg.pieces.T
     weight = coefficients(sets)[:, :3]
-    east, north = (rows[:3, b] - rows[:3, a] for rows in leg.basis)
-    chord = leg.fixes_n[b] - leg.fixes_n[a]
+    east, north = (rows[:3, last] - rows[:3, first] for rows in leg.basis)
+    chord = leg.fixes_n[last] - leg.fixes_n[first]
     course = arctan2(chord[:, 1], chord[:, 0])
     reckoned = arctan2(weight @ north, weight @ east)
     return wrap(reckoned + np.asarray(sets, dtype=float)[:, 2:] - course)
