@@ -22,6 +22,7 @@ from odocal_ros.data.arrays import (
     map_windows,
     median,
     release_mapped_memory,
+    runs,
 )
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.nav.rotations import (
@@ -196,12 +197,11 @@ def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict
     """Return the white noise variances at standstills, by sensor: 'gyro', 'accel'; {}: too few."""
     turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
     T = np.diff(imu.t_keyframes)[:, None]
-    inside = at_rest[:-1] & at_rest[1:]
-    rest = np.flatnonzero(inside)
-    stops = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
+    stops = [slice(begin, end) for begin, end in runs(at_rest[:-1] & at_rest[1:])
+             if end - begin > 2]
     # second differences contain no bias and no drift; their variance is six times as large
     squares = [[(np.diff((x / T)[stop], n=2, axis=0)**2).sum(axis=1) * T[stop][1:-1, 0] / 6
-                for x in (turn, force)] for stop in stops if len(stop) > 2]
+                for x in (turn, force)] for stop in stops]
     both = np.concatenate([np.zeros((2, 0)), *squares], axis=1)
     if both.shape[1] < 15:      # of three axes each: with fewer, a variance has a sigma above 30 %
         return {}

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Bools, Floats, runs
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at
@@ -126,11 +126,9 @@ class TravelError(Factor):
 
 def standstill_weights(at_rest: Bools) -> Floats:
     """Return the weights of rounding errors, (N,), whose sum over each standstill is 1."""
-    starts = np.flatnonzero(np.diff(at_rest, prepend=False) & at_rest)
-    stops = np.flatnonzero(np.diff(at_rest, append=False) & at_rest) + 1
     weight = np.ones(len(at_rest))
-    for first, last in zip(starts, stops, strict=True):
-        weight[first:last] = 1 / (last - first)
+    for begin, end in runs(at_rest):
+        weight[begin:end] = 1 / (end - begin)
     return weight
 
 

@@ -168,25 +168,27 @@ class TwistNoise:
         In (m/s)^2 and (rad/s)^2, mean of the legs; the turn rate is NaN if it is not measured.
         speed, turn_rate : m/s, rad/s.
         """
-        mean: Floats = np.mean([self._of_leg(leg, abs(speed), abs(turn_rate))
+        mean: Floats = np.mean([self._leg_variances(leg, abs(speed), abs(turn_rate))
                                 for leg in self.legs], axis=0)
         return mean
 
-    def _of_leg(self, leg: dict[str, Any], v: float, w: float) -> Floats:
+    def _leg_variances(self, leg: dict[str, Any], v: float, w: float) -> Floats:
         noise, odometer, T = leg['noise'], leg['odometer'], self.period
         K = self._known('scale_factor')[0]
         factor = self._known(AS_SENT)[0] or K
         # as in interval_noise.py: noise is proportional to the time, below 1 m/s to the path
-        rate, hard = min(max(v, 0.02), 1.0) / T, odometer['hard']
+        per_level = min(max(v, 0.02), 1.0) / T      # 1/s, variance of a mean speed over its level
+        hard = odometer['hard']                     # share of the time with acceleration
         reading = (K * odometer['reading'])**2 / T**2       # of one reading; an interval has two
         along = (1 - hard) * noise['along']**2 + hard * noise['along_hard']**2
-        sway_rate = rate * T / max(T, SWAY_TIME)
+        sway_per_level = per_level * T / max(T, SWAY_TIME)
         steps = noise.get('steps')
         if steps is not None:     # the fit does not use the integral of such a speed
             along, reading = 0.0, 0.0
         side = noise['side_turn' if w > TURNING_RATE else 'side']**2
         white = leg['widened']**2 * np.array(
-            [along * rate + 2 * reading, side * sway_rate, noise['up']**2 * sway_rate])
+            [along * per_level + 2 * reading, side * sway_per_level,
+             noise['up']**2 * sway_per_level])
         arm_x, arm_y = (np.square(self._known(f'odometer_lever_arm_{axis}')).sum()
                         for axis in 'xy')
         by_sideslip = _mean_square(leg['sideslip']) * (v**2 * w)**2
@@ -195,7 +197,7 @@ class TwistNoise:
         coarse = (K * odometer['speed_step'])**2 / 12 * max(steps or 1.0, 1.0)**2 + (
             (factor - K) / K * v - K * leg['speed_offset']['value'])**2 * (factor != K)
         return np.append(white + constant + [coarse, 0.0, 0.0],
-                         self._turn_rate(leg, v, w, rate, reading))
+                         self._turn_rate(leg, v, w, per_level, reading))
 
     def _scale_variance(self, leg: dict[str, Any], v: float) -> float:
         """Return the variance of the speed by the scale: its sigma and its change with speed."""
@@ -204,7 +206,7 @@ class TwistNoise:
         change = (v**2 - leg['odometer']['square_speed']) / (2 * FAST_SPEED)
         return float(v**2 * ((sigma / scale)**2 + by_speed * change**2))
 
-    def _turn_rate(self, leg: dict[str, Any], v: float, w: float, rate: float,
+    def _turn_rate(self, leg: dict[str, Any], v: float, w: float, per_level: float,
                    reading: float) -> float:
         """Return the variance of the turn rate from the difference of two wheels."""
         if not self.has_turn_rate:
@@ -216,7 +218,7 @@ class TwistNoise:
         walk = turning if w > TURNING_RATE else (1 - hard) * constant + hard * accelerating
         # the mean of two wheels has half the variance of one; their deviations from the mean have
         # opposite signs
-        white = leg['widened']**2 * (4 * walk * rate + 8 * reading)
+        white = leg['widened']**2 * (4 * walk * per_level + 8 * reading)
         ratio = left['ratio_sigma'] + right['ratio_sigma']
         return float(white + (sigma * w)**2 + (ratio * v)**2) / width**2
 
