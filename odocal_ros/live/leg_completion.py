@@ -39,14 +39,11 @@ LATE_TOPIC_S = 1.0   # judgement: longest wait for late topics at the stop mark
 
 
 class LegCompletion:
-    """
-    Processes a leg. Nothing blocks: the worker computes, and ``tick`` handles its results.
-
-    config : returns the configuration in force; a running leg keeps that of its start.
-    """
+    """Processes a leg. Nothing blocks: the worker computes, and ``tick`` handles its results."""
 
     def __init__(self, node: CheckedNode, recording: Recording, publishing: Publishing,
                  journal: Journal, config: Callable[[], Config]) -> None:
+        """Use ``config()``, the configuration in force; a running leg keeps that of its start."""
         self.session = Session()
         self.session.restored = restored_from(publishing.results())
         self._recording, self._publishing, self._config = recording, publishing, config
@@ -226,8 +223,8 @@ class LegCompletion:
         """Hand the leg to the worker once each topic has passed the stop mark, or time is up."""
         if self._close_by_ns is None:
             return
-        is_time_up = time.monotonic_ns() > self._close_by_ns
-        if is_time_up or self._recording.has_passed(self.session.stop_ns):
+        if (time.monotonic_ns() > self._close_by_ns
+                or self._recording.has_passed(self.session.stop_ns)):
             self._close_by_ns = None
             self._journal.end()
             self._snapshot = self._recording.snapshot()
@@ -235,11 +232,10 @@ class LegCompletion:
 
     def _compute(self, samples: LegRecorder) -> None:
         session = self.session
-        kept_results = [leg.results for leg in session.legs]
         self._active_job.submit(partial(
-            worker.compute, samples, session.start_ns, session.stop_ns, kept_results,
-            session.config, session.carried, session.is_automatic, self._active_job.report),
-            self._handle_leg_result)
+            worker.compute, samples, session.start_ns, session.stop_ns,
+            [leg.results for leg in session.legs], session.config, session.carried,
+            session.is_automatic, self._active_job.report), self._handle_leg_result)
 
     def _fail(self, error: str) -> None:
         """Report that the computation of a leg, or the publication of its result, failed."""
