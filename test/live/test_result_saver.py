@@ -35,7 +35,7 @@ def saving():
                     lambda: None, '/calibrator')
 
     def run(calibration, folder, by_operator=True):
-        config = with_settings(Config(), {'output.directory': str(folder)})
+        config = with_settings(Config(), {'output.directory': str(folder), 'vehicle': 'car 3'})
         future = saver.save(calibration, config, {}, 'imu_link', NOW_NS, by_operator)
         wait_for(lambda: worker.poll() or future.done(), 'the answer of save')
         return future.result()
@@ -86,7 +86,7 @@ def test_neither_the_answer_nor_a_leg_waits_for_the_report(saving, tmp_path, mon
         gate.wait(20), ('<html></html>', ''))[1])
     saving.save(GOOD, tmp_path)
     content = json.loads((tmp_path / 'latest' / 'calibration.json').read_text())
-    assert content['inputs'][0]['node'] == '/calibrator'
+    assert (content['vehicle'], content['inputs'][0]['node']) == ('car 3', '/calibrator')
     assert not (tmp_path / 'latest' / 'report.html').exists()
     worker.submit(lambda: 'a leg', lambda result, error: done.append(result))
     wait_for(lambda: worker.poll() or done, 'the leg')
@@ -123,8 +123,10 @@ def test_pending_jobs_are_finished_at_the_end_but_a_long_one_does_not_delay_it()
     assert done == ['saved']
 
 
-def test_each_node_has_its_own_folder_in_the_ros_home(tmp_path, monkeypatch):
+def test_each_node_has_its_own_folder_in_the_ros_home(saving, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    assert saving.save(GOOD, '')[0]
+    assert (tmp_path / 'odocal/calibrator/latest').exists()
     assert output_root(Config(), '/calibrator') == tmp_path / 'odocal/calibrator'
     assert output_root(Config(), '/car4/calibrator') == tmp_path / 'odocal/car4/calibrator'
     monkeypatch.delenv('ROS_HOME')
