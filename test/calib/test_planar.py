@@ -99,7 +99,7 @@ def test_fit_without_noise_is_exact(moves, options, expected, loose):
     assert_allclose(found.value[offset:offset + 2], 0.0, atol=loose)
 
 
-def test_offset_of_the_tracked_point_is_estimated_exactly():
+def test_offset_of_the_tracked_point_gyro_scale_and_bias_are_estimated_exactly():
     """A point 0.1 m ahead and 0.05 m right of the axle moves when the robot turns."""
     run = run_of(body(SQUARES))
     psi = np.append(0.0, np.cumsum(body(SQUARES)[:, 2])) + 0.3
@@ -108,6 +108,11 @@ def test_offset_of_the_tracked_point_is_estimated_exactly():
     found = fit_run(run, PriorKnowledge())
     assert_allclose(found.value[3:5], (0.1, -0.05), atol=1e-5)
     assert_allclose(found.value[2], 1 / WIDTH, rtol=1e-5)
+    run = run_of(body(SQUARES))
+    turn = body(SQUARES)[:, 2]
+    found = fit_run(replace(run, gyro=1.02 * turn + 0.01 * STEP), PriorKnowledge())
+    assert_allclose(1 + value(found, 'gyro_scale')[0], 1 / 1.02, rtol=1e-5)
+    assert_allclose(value(found, 'gyro_bias')[0], 0.01 / 1.02, rtol=1e-3)
 
 
 def test_wheels_that_differ_by_a_few_per_cent_do_not_affect_the_scale(monkeypatch):
@@ -133,14 +138,6 @@ def test_omni_rows_agree_with_omni_wheel_drive_controller():
     assert_allclose(forward, (0, 10, 0, -10), atol=1e-12)
     assert_allclose(left, (-10, 0, 10, 0), atol=1e-12)
     assert_allclose(turn, -10)
-
-
-def test_gyro_scale_and_bias_are_exact():
-    run = run_of(body(SQUARES))
-    turn = body(SQUARES)[:, 2]
-    found = fit_run(replace(run, gyro=1.02 * turn + 0.01 * STEP), PriorKnowledge())
-    assert_allclose(1 + value(found, 'gyro_scale')[0], 1 / 1.02, rtol=1e-5)
-    assert_allclose(value(found, 'gyro_bias')[0], 0.01 / 1.02, rtol=1e-3)
 
 
 def test_sigma_of_a_straight_run_equals_the_bound():
@@ -180,8 +177,7 @@ def test_truth_is_within_sigma(kind):
         rng = np.random.default_rng(100 + seed)
         d = body(SQUARES + arcs + sideways)
         found = fit_run(run_of(d, kind, arc=0.5 * (kind == 'skid'), slip=3e-3, noise=0.005,
-                               every=2,
-                               rng=rng, count=3), PriorKnowledge())
+                               every=2, rng=rng, count=3), PriorKnowledge())
         truth = {'left': LEFT, 'right': RIGHT, 'inverse_track_width': 1 / WIDTH, 'arc': 0.5,
                  'lateral': 0.95} | {f'wheel_{k}': one for k, one in enumerate(SCALES, 1)}
         off.append([(value(found, n)[0] - truth[n]) / value(found, n)[1]
@@ -204,8 +200,7 @@ def increments(seed=0, walk=1e-3**2, reading=0.0, k=K, ratio=1e-3):
         np.sqrt(reading) * draw.standard_normal(k + 1))
     path = np.full(k, PATH)
     return Increments(ratio * path + error, path[:, None], np.array([np.inf]), np.zeros(1),
-                      max(reading, NO_READING), np.ones(k), np.zeros(k, int),
-                      np.array([2e-3**2]))
+                      max(reading, NO_READING), np.ones(k), np.zeros(k, int), np.array([2e-3**2]))
 
 
 def uneven():
