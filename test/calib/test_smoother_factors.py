@@ -61,7 +61,7 @@ def moved():
     c = 1e-3 * np.insert(rng.standard_normal(layout.M - 6), [
         layout.FIX_MOTION_TIME, *2 * [layout.BODY_TILT.start + 2],
         *3 * [layout.FIX_ERROR_BY_SIGMA.start - 3]], 1.0)
-    # derivatives by biases treat these as constant over HILL_INTERVALS: no bump centre or body
+    # derivatives by biases treat these as constant within hills: no bump centre or body
     # centre of real size, because derivatives neglect how they change the effect of the others
     c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.LIFT] = 0.0, np.log(5.0), 0.01
     c[layout.MEAN_ROLL] = 0.01

@@ -129,7 +129,7 @@ def test_the_hint_states_the_value_what_is_missing_and_its_age(updates):
     far = replace(of_sigmas(updates[-1], scale=2e-3, yaw=0.02), distance_m=300.0)
     text = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the limit: 500 m more for white errors, 1500 m for slow ones, here some of both
-    assert (' m/pulse ± 2000 ppm so far; drive 710 m more to reach the limit of 1000 ppm; yaw '
+    assert (' m/pulse ± 2000 ppm so far; drive 670 m more to reach the limit of 1000 ppm; yaw '
             in text)
     assert text.endswith('; for the yaw: stop and start 12 times, or make as many turns')
     stated = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))

@@ -13,7 +13,6 @@ change the path length.
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, iterate_releasing
-from odocal_ros.estimator.factors.body_tilt import moving_mean
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
@@ -22,6 +21,9 @@ from odocal_ros.settings.nominal import G
 
 WALK_SPEED = 1.0     # m/s, judgement: below it, slopes are reduced towards zero
 WARM_TIME = 600.0    # s, physical: tyres warm within ten minutes of driving
+# definition: weights of the middle of a parabola through seven values (Savitzky and Golay, 1964).
+# Judgement: hills and banks last longer; the rest of a tilt is that of the body, by bumps
+HILL_WEIGHTS = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0])
 RATE_WINDOW = 0.1    # s about a keyframe, judgement: the mean of it contains little vibration
 
 
@@ -33,12 +35,38 @@ def mean_rates_at(times: Floats, t: Floats, w_b: Floats) -> Floats:
                      for k in iterate_releasing(range(len(times)))])
 
 
+def follow_hills(x: Floats) -> Floats:
+    """Return the values of parabolas through HILL_WEIGHTS.size intervals at their middle: (K,)."""
+    half = HILL_WEIGHTS.size // 2
+    filtered, total = (np.convolve(y, HILL_WEIGHTS)[half:half + len(x)]
+                       for y in (x, np.ones(len(x))))
+    return filtered / total
+
+
+def separate_tilts(tilt: Floats, acceleration: Floats, path: Floats) -> tuple[Floats, Floats]:
+    """
+    Return the tilt of the ground, level in the mean, and that of the body on it: (N,) rad each.
+
+    tilt : (N,) rad, of the body in n.   acceleration : (N,) m/s^2, along the axis that tilts up.
+    path : (N,) weights of means.
+    """
+    # of body = c (acceleration + G * of ground) + bumps: springs also react to gravity on a slope.
+    # c > 0: ground that leans into turns is a bank
+    share = path / max(path.sum(), 1e-9)
+    deviation = acceleration - share @ acceleration
+    by_force = max(share @ (deviation * tilt), 0.0) / max(share @ deviation**2, 1e-9)
+    at_rest = tilt - by_force * acceleration
+    at_rest = at_rest - share @ at_rest
+    ground = follow_hills(at_rest) / (1 + G * by_force)
+    return ground, at_rest + by_force * acceleration - ground
+
+
 class Axle:
     """
     Motion of the origin of base_link, where the axle does not slip sideways, at a state.
 
-    v_n : (N, 3) m/s, its velocity at the keyframes.   wheel_speed : (N,) m/s, forward, at the
-    odometer.
+    At the keyframes: v_n, (N, 3) m/s, its velocity; left_acceleration, (N,) m/s^2; wheel_speed,
+    (N,) m/s, forward, at the odometer.
     """
 
     def __init__(self, problem: Problem, state: State) -> None:
@@ -51,6 +79,9 @@ class Axle:
             return state.v_n + rotate(state.C_nb, np.cross(rate, state.C_bv @ arm_v))
 
         self.v_n = velocity_at(arm)
+        # at the keyframe, as the roll: a mean of the intervals beside it precedes and follows a
+        # turn by a second, and the difference would be a bank (decisions/0009)
+        self.left_acceleration = self._forward_speed(self.v_n) * (rate @ state.C_bv[:, 2])
         self.wheel_speed = self._forward_speed(velocity_at(arm + leg.odometer_arm))
 
     def _forward_speed(self, v_n: Floats) -> Floats:
@@ -65,21 +96,19 @@ class Axle:
         return (up[1:] + up[:-1]) * double_speed / np.maximum(double_speed**2,
                                                               (2 * WALK_SPEED)**2)
 
-    def _bank(self, left_up: Floats, acceleration: Floats) -> Floats:
-        """
-        Return the bank of the road in each interval, left side up: (K,) rad.
+    def body_pitch(self) -> Floats:
+        """Return the pitch of the body on its springs at the keyframes, nose up: (N,) rad."""
+        speed = self._forward_speed(self.v_n)
+        return self._tilts(self.state.forward, np.gradient(speed, self.state.t))[1]
 
-        left_up : (N,) upward component of the left axis.   acceleration : (K,) m/s^2 to the left.
-        """
-        # without bumps, which tilt the body only. A body rolls in turns: its roll at no lateral
-        # acceleration is that of the IMU, on a road that is level in the mean
-        roll = moving_mean((left_up[1:] + left_up[:-1]) / 2)
-        path = np.linalg.norm(self.v_n[1:] + self.v_n[:-1], axis=1) * np.diff(self.state.t)
-        share = path / max(path.sum(), 1e-9)
-        deviation = acceleration - share @ acceleration
-        by_acceleration = share @ (deviation * roll) / max(share @ deviation**2, 1e-9)
-        bank: Floats = roll - share @ (roll - by_acceleration * acceleration)
-        return bank
+    def rolls(self) -> tuple[Floats, Floats]:
+        """Return the bank of the road and the roll of the body on it, left side up: (N,) rad."""
+        return self._tilts(self.state.C_bv[:, 1], self.left_acceleration)
+
+    def _tilts(self, axis_b: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
+        """Return tilts of ground and body along an axis, by ``separate_tilts``: (N,) rad each."""
+        path = np.linalg.norm(self.v_n, axis=1) * np.gradient(self.state.t)
+        return separate_tilts(self.state.C_nb[:, 2] @ axis_b, acceleration, path)
 
     def lean_accelerations(self, mean_rate: Floats) -> Floats:
         """
@@ -94,7 +123,8 @@ class Axle:
         # by speed and turn rate: a velocity difference of the axle has the noise of two turn rates
         # times its distance from the IMU, which reduces the estimated sideslip (decisions/0009)
         left = (speed[1:] + speed[:-1]) / 2 * (mean_rate @ self.state.C_bv[:, 2])
-        left += G * self._bank(self.state.C_nb[:, 2] @ self.state.C_bv[:, 1], left)
+        bank, _ = self.rolls()
+        left += G * (bank[1:] + bank[:-1]) / 2
         force = np.stack([np.diff(speed) / T + G * self._slope(), left], -1)
         jerk = np.gradient(force, axis=0) / T[:, None] if len(T) > 1 else np.zeros_like(force)
         return np.concatenate([force, jerk], axis=1)

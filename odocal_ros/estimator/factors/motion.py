@@ -18,7 +18,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at, WALK_SPEED
-from odocal_ros.estimator.factors.body_tilt import BodyTilt, moving_mean
+from odocal_ros.estimator.factors.body_tilt import BodyTilt
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BG, E, P, PHI, State, V
@@ -29,6 +29,7 @@ from odocal_ros.nav.rotations import exp_so3, level_left, rotate, rotvec, skew, 
 # P, V, PHI, BG and BA
 D = slice(E, E + 3)
 ROWS = D.stop
+BOUNCE_INTERVALS = 5    # judgement: a slope less their mean is that of a bounce, not of the road
 # attributes of Motion with a row for each interval
 INTERVAL_ATTRIBUTES = (
     'T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'displacement', 'wheel_displacement', 'by_delay',
@@ -41,7 +42,11 @@ def squared_bounce(inclination: Floats, slope: Floats) -> Floats:
     """Return the squared inclination by a bounce of the body on its springs, (S11a): (K,)."""
     # of the path to the body and to the horizontal: a bounce changes both, sway the former only, a
     # crest the latter only
-    squared = (inclination - moving_mean(inclination)) * (slope - moving_mean(slope))
+    window = np.ones(BOUNCE_INTERVALS)
+
+    def changes(x: Floats) -> Floats:
+        return x - np.convolve(x, window, 'same') / np.convolve(np.ones(len(x)), window, 'same')
+    squared = changes(inclination) * changes(slope)
     return np.clip(squared, -0.5, 0.5)      # keeps the root real far from the solution
 
 
@@ -156,7 +161,7 @@ class Motion:
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES, None] \
             + self.half_pitch_variance[:, None] * c[layout.SCALE_BY_PITCHING]
         pitch, yaw = self.lean_angles
-        self.tilt = BodyTilt(state, self.sums.mean_rate, self.lean_accelerations[:, 1])
+        self.tilt = BodyTilt(state, self.sums.mean_rate, self.axle)
         self.rate_n, self.level_left = self.tilt.rate_n, self.tilt.level_left
         self.by_tilt = self.tilt.displacements
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
@@ -207,7 +212,7 @@ class Motion:
         gyro[:, PHI], gyro[:, V] = C @ s.R_by_gyro, -C @ s.dv_by_gyro
         gyro[:, P], gyro[:, D] = -C @ s.dp_by_gyro, -C @ s.S_by_gyro
         a[:, :, BG] = gyro[:, :, :3]
-        # by the pitch of BODY_TILT. A bias changes little over HILL_INTERVALS: it does not
+        # by the pitch of BODY_TILT. A bias changes little within hills: it does not
         # affect the part of bumps
         _, left, up = state.C_bv_level.T
         lift = T * (C @ up)[:, :, None]
