@@ -4,9 +4,8 @@
 """
 Travel of one wheel in a stream, with the variance of lost travel.
 
-Rollovers are corrected, and resets are interpolated. A leg is screened as a whole
-(``nav/odometer.py``, ``screening/odometer_rows.py``). A stream has only earlier rows, but its
-scale is known: rows that no vehicle can cause are refused.
+Rollovers are corrected, resets are interpolated, and rows that no vehicle can cause are refused.
+A stream has only earlier rows, unlike a leg (``nav/odometer.py``), but its scale is known.
 """
 
 from bisect import bisect_left
@@ -25,11 +24,9 @@ HARD_BRAKING, WHEEL_ACCELERATION = 5.0, 15.0
 # judgement: longest burst of stamps, s; largest deviation of a row, in mean jitters of the stamps;
 # rows of the mean jitter
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
-# judgement: limit of the lateness of a row in the mean jitter, because lost counts are not jitter:
-# this multiple of the mean, plus s
+# judgement: limit of the lateness of a row, mean jitters plus s: lost counts are not jitter
 LATENESS_RATIO, LATENESS_OFFSET = 2.0, 1e-3
-# judgement: least deviation of a counter that stops abruptly, in mean jitters; the rows of one
-# that holds its values have 3
+# judgement: least deviation of a counter that stops abruptly, mean jitters; of held values: 3
 HUNG_JITTERS = 2.0
 # judgement: rows before the first test; number of consecutive rows that are refused, and their
 # least duration, s, before one is accepted
@@ -47,8 +44,7 @@ class Wheel:
         self.form = form
         self.scale = -scale if reversed_counts else scale      # m per unit, signed
         self.quantum = 0.0             # m, size of a count, 0 if values are not counts
-        self.speed = 0.0               # m/s, of the last rows
-        self.mean_interval = 0.0       # s between rows
+        self.speed = self.mean_interval = 0.0     # m/s, of the last rows; s between rows
         self.is_hung = False           # it stopped abruptly, and has not moved since
         self.notes: list[str] = []
         self.t: deque[float] = deque()

@@ -22,15 +22,8 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints, release_mapped_memory
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.imu import ImuSteps
-from odocal_ros.nav.rotations import (
-    exp_so3,
-    matrix_from_quat,
-    quat_conjugate,
-    quat_from_rotvec,
-    quat_multiply,
-    rotate,
-    skew,
-)
+from odocal_ros.nav import rotations
+from odocal_ros.nav.rotations import exp_so3, matrix_from_quat, rotate, skew
 from odocal_ros.nav.strapdown import prefix_product
 
 STEPS_AT_A_TIME = 2048    # judgement: they stay in the cache; 256 double the time of a pass
@@ -178,12 +171,12 @@ class _Chunk:
         # integral of the attitude over a step of unit length, and the integral of that
         self.G = np.eye(3) + skew(self.turn_mean) + square / 6
         self.GG = np.eye(3) / 2 + skew(self.turn_mean / 2 - self.turn / 12) + square / 24
-        q = quat_multiply(quat_from_rotvec(-rotate(self.G, gyro)),
-                          quat_from_rotvec(imu.turn[rows]))
+        q = rotations.quat_multiply(rotations.quat_from_rotvec(-rotate(self.G, gyro)),
+                          rotations.quat_from_rotvec(imu.turn[rows]))
         q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], q]))
-        to_start = quat_conjugate(q[self.first])[self.interval]
-        self.R = matrix_from_quat(quat_multiply(to_start, q[:-1]))
-        self.R_end = matrix_from_quat(quat_multiply(to_start[self.end - 1], q[self.end]))
+        to_start = rotations.quat_conjugate(q[self.first])[self.interval]
+        self.R = matrix_from_quat(rotations.quat_multiply(to_start, q[:-1]))
+        self.R_end = matrix_from_quat(rotations.quat_multiply(to_start[self.end - 1], q[self.end]))
         # an error that rotates the step uniformly turns a force by its time since the start
         self.growth = np.eye(3) + skew(self.turn) / 3
         dv, dp, rotation = imu.dv[rows], imu.dp[rows], rotate(self.growth, gyro)

@@ -62,12 +62,10 @@ def sentence(calibration: result.Calibration) -> str:
 def values_in_words(estimates: dict[str, result.Estimate]) -> str:
     """Return scale, angles and, if known, wheel factors and track width, with sigmas."""
     scale = texts.finite_estimate(estimates, 'scale_factor')
-    parts = []
-    if scale.value is None:
-        parts.append('scale factor not determined')
-    else:
+    parts = ['scale factor not determined']
+    if scale.value is not None:
         counts = f' ({texts.inverse_text(scale)})' if scale.unit in texts.COUNTS else ''
-        parts.append(f'scale factor {texts.with_unit(scale)}{counts}')
+        parts = [f'scale factor {texts.with_unit(scale)}{counts}']
     labels = {name: name.removeprefix(result.FACTOR) for name in result.wheel_factors(estimates)}
     for name, label in (labels | {'track_width': 'track width'}).items():
         wheel = texts.finite_estimate(estimates, name)
