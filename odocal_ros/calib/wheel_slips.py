@@ -22,10 +22,9 @@ class WheelSlips:
 
     begin: Floats    # s
     end: Floats      # s
-    size: Floats     # m, > 0: farther; unknown wheel: right minus left
+    size: Floats     # m, > 0: the wheel turned too far; unknown wheel: right minus left
     wheel: Ints      # -1 left, +1 right, 0 unknown
-    # of the ratio right over left in the drive, converted to one at half the path
-    change: float = 0.0
+    change: float = 0.0    # of the ratio right / left in the drive, as one step at half the path
     count: int = 2                   # number of wheels in the mean
 
     @property

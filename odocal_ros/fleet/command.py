@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--task-memory', type=_byte_count, default=2 * GIB, metavar='SIZE', help='memory limit '
         'per bag (default 2G)')
     add('--tries', type=_positive_count, default=3, metavar='N', help='attempts for a '
-        'bag whose local worker process ends (default 3)')
+        'bag whose local worker process is killed (default 3)')
     add('--again', action='store_true', help='retry bags that failed')
     add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles that '
         'get a report of their own')

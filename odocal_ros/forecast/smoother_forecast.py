@@ -40,8 +40,8 @@ ONLY_SMOOTHER = ('smoother',)
 SCALE, YAW, PITCH = PARAMETERS
 # physical: m/s^2 of an ordinary stop and start, and the minimum speed for it, m/s
 STOP_ACCELERATION, STOP_SPEED = 1.5, 5.0
-# physical: path length is proportional to sigma^-power, for white and for time-correlated errors
-# of the fixes
+# physical: path length is proportional to sigma^-power. White errors of the fixes: the ends count,
+# sigma ~ 1 / length; time-correlated ones: sections count, sigma ~ 1 / sqrt(length)
 PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
 MAX_STOPS = 50    # judgement: limit of a useful number of stops and starts
 # codes that disappear with more driving

@@ -4,10 +4,11 @@
 """
 Dead reckoning: track in n from attitude and odometer travel, linear in scale and forward axis.
 
+n is Cartesian and fixed to the Earth, so that the track is exact on the ellipsoid; b: the IMU.
+
 ``P`` is the sum of attitude over travel: the track of a vehicle whose forward axis in b is d and
 whose scale is K is P @ (K d). P does not depend on scale, yaw and pitch, so they can be solved
-for, or varied, without another pass. n is Cartesian and fixed to the Earth, so the track is exact
-on the ellipsoid.
+for, or varied, without another pass.
 """
 
 from dataclasses import dataclass
@@ -127,8 +128,8 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
     """
     Return metres per unit of travel from distances between fixes, None without motion.
 
-    It is the median of equal sections of the path, as short as possible with chords of
-    ``min_chord``, m, and eight sigmas. Despite outliers its error is a few per cent: enough for
+    It is the median of equal sections of the path, as short as possible with chords of at least
+    ``min_chord``, m, and of eight sigmas. Despite outliers its error is a few per cent: enough for
     thresholds and for scales without a nominal value. If the path folds back within ``min_chord``
     (the lanes of a mower), the ratio of shorter sections is larger and is used.
     """

@@ -36,8 +36,8 @@ COMMANDS = {      # name: (its module, or the package that has it as an entry po
     'watch': ('odocal_ros.live.node_commands', 'show the progress of a running node'),
     'doctor': ('odocal_ros.offline.doctor', 'show the installation, for bug reports'),
     'compare': ('odocal_ros.offline.compare', 'compare calibrations: changes in sigmas'),
-    'paper': ('odocal_reproductions', 'reproduce tables 1-4 of the two-point paper'),
-    'patent': ('odocal_reproductions', 'compute the embodiment of CN104359492A'),
+    'paper': ('odocal_reproductions', 'reproduce tables 1-4 of Shi et al. 2015, two-point method'),
+    'patent': ('odocal_reproductions', 'compute the example of patent CN104359492A'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130    # definition: exit codes
 # formats of tqdm for a phase: fraction done known, or not

@@ -68,8 +68,8 @@ def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) ->
     add_input_arguments(parser, **topics)
     add = parser.add_argument
     add('--leg', action='append', default=[], metavar='A:B',
-        help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
-        'each-stop; repeatable')
+        help='seconds from the first message (or since 1970); A/B for ISO 8601 dates; each-stop: '
+        'a leg between each two stops; repeatable')
     add('--method', choices=('auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'),
         help='method that gives the result (wheels: alias of smoother; patent: smoother, plus '
         'the search of two wheels; all: each method)')

@@ -122,7 +122,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--real', action='append', default=[], metavar='NAME=VALUE', dest='sensor_parameters',
         help='one parameter of a real sensor, SI and radians; repeatable')
     add('--known-heading-sigma-deg', type=float, metavar='DEG',
-        help='put a heading of this accuracy into calibrator.yaml')
+        help='set the start heading, with an error of this sigma, in calibrator.yaml')
     add('--storage', default='mcap', metavar='KIND', help='mcap (default), sqlite3 or rosbag1')
     add('--compression', default='none', metavar='KIND',
         help='none (default), message, file or storage (mcap chunks)')

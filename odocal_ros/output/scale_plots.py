@@ -95,7 +95,7 @@ def by_window(windows: Floats, name: str) -> style.Drawing:
             'line at 0 shows that fix errors do not depend on the motion. If short windows '
             'differ, the fixes contain an odometer, or are filtered or late.')
     picture = style.svg(figure, f'{name}-by-window', text)
-    return 'Scale against the length of the window', text, picture
+    return 'Scale in time windows of different length', text, picture
 
 
 def comparison_figure(calibration: Calibration, name: str) -> list[style.Drawing]:

@@ -35,12 +35,17 @@ def two_point(prepared: PreparedLeg, report_pass: PassCallback | None = None) ->
 
 
 class TwoPointRun:
-    """One run of the method on a leg; collects its reasons."""
+    """
+    One run of the method on a leg; collects its reasons.
+
+    f : (3,) scale factor times the forward axis in b.   factor : (3,) on the stated sigmas of the
+    fixes.   reasons : on the method.   data_reasons : on the inputs.
+    """
 
     def __init__(self, prepared: PreparedLeg) -> None:
         self.prepared, self.inputs = prepared, prepared.inputs
         self.config, self.track = prepared.config, prepared.track
-        self.reasons: list[Reason] = []            # on the method
+        self.reasons: list[Reason] = []
         self.data_reasons: list[Reason] = []
         self.slip_reasons: tuple[Reason, ...] = ()
 
@@ -52,7 +57,7 @@ class TwoPointRun:
         if chord is None or refused:
             return MethodRun(refused_result(refused, self.inputs.scale_unit),
                              data_reasons=tuple(self.data_reasons))
-        f, _ = solve(chord, np.inf)
+        f, _ = solve(chord, up_scale=np.inf)
         t_fix = self.inputs.t_fix
         between = (t_fix >= chord.start.t) & (t_fix <= chord.end.t)
         inside, outlier_reasons = without_outliers(self.prepared, self.prepared.path(f),
@@ -62,7 +67,7 @@ class TwoPointRun:
         factor = np.ones(3)
         if between.sum() >= 3:
             chord, factor = self._fit_noise(chord, f, between)
-        chord = replace(chord, slips=self._find_slips(chord, solve(chord, factor[2])[0]))
+        chord = replace(chord, slips=self._find_slips(chord, solve(chord, up_scale=factor[2])[0]))
         method = fit(chord, self.prepared.nominal_scale, self.inputs.scale_unit,
                      self.inputs.travel.quantum, factor, self.config)
         self._check_counting_direction(chord)
@@ -103,7 +108,8 @@ class TwoPointRun:
         exact = all(m.standing or m.surveyed for m in (start, end))
         if exact or refusal_reasons(chord, prepared.rough_scale):
             return chord
-        path = prepared.path(solve(chord, np.inf)[0])      # marks in motion depend on the solution
+        # marks in motion depend on the solution
+        path = prepared.path(solve(chord, up_scale=np.inf)[0])
         return replace(chord, start=prepared.mark(start.t, path, 'start') or start,
                        end=prepared.mark(end.t, path, 'end') or end)
 
@@ -143,7 +149,7 @@ class TwoPointRun:
                 (chord.start, chord.end), prepared.spans, fixes[0], self.track.at(fixes[0]) @ f,
                 chord.M @ f, residual / factor[0], covariance, drift_n / factor[0])
             chord = replace(chord, start=start, end=end)
-        f, _ = solve(chord, factor[2])
+        f, _ = solve(chord, up_scale=factor[2])
         self._check_track(chord, f, fixes, residual, drift)
         return chord, factor
 
@@ -176,8 +182,8 @@ class TwoPointRun:
 
     def _check_counting_direction(self, chord: Chord) -> None:
         """Add the reason for an odometer that counts down without a known IMU orientation."""
-        backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
-        if (backwards and self.prepared.imu_orientation is None
+        counts_down = self.track.s[-1] < self.track.s[0]
+        if (counts_down and self.prepared.imu_orientation is None
                 and not chord.alignment.heading_separable):
             self.data_reasons.append(Reason(
                 Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive counts '

@@ -111,7 +111,7 @@ def repeated_counts(value: Values, modulus: int) -> Bools:
     size = np.abs(counter_steps(value, modulus))
     update = np.flatnonzero(size) + 1
     interval_rows = np.diff(update)
-    # an update of several counts after rows without one: judgement, fewer are rounding
+    # judgement: rows without counts between smaller updates, of one count and two, are slow motion
     min_counts = 3.0
     if len(update) < MIN_STEPS or np.median(interval_rows) < 2 or (
             np.median(size[update - 1]) < min_counts * size[update - 1].min()):

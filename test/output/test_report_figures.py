@@ -68,7 +68,7 @@ def test_the_scale_is_drawn_against_speed_and_window_length(good):
     found = np.array([[2.0, 4e-3, 1e-3, 300], [20.0, 1e-3, 1e-3, 30], [200.0, 0.0, 1e-3, 12]])
     with apply_style():
         title, says, drawn = by_window(found, 'leg1')
-    assert title == 'Scale against the length of the window'
+    assert title == 'Scale in time windows of different length'
     assert 'the fixes contain an odometer' in says
     assert all(f'>{length}<' in drawn for length in (2, 20, 200))
 

@@ -198,6 +198,7 @@ class PointRows(Factor):
         return variances.reshape(len(present), -1, self.r.shape[1])
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
+        # covariances of the stated parameters with the predictions of the rows
         n, effects = self.n, []     # columns of J and of J_end in the joint marginals
         columns, end = np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
         for present, gather in self._intervals():
@@ -225,7 +226,7 @@ def rows_per_independent(rows: PointRows) -> float:
     r = np.clip(r, -TAIL_SIGMAS * scale, TAIL_SIGMAS * scale)
     r = r - r.mean(axis=0)
     power, count, length = (r**2).mean(), 1.0, 2
-    while len(r) >= 12 * length and power > 0:      # 12 bins: their variance has a sigma of 20 %
+    while len(r) >= 12 * length and power > 0:      # 12 bins of 2 axes: variance +- 29 %
         bins = r[:len(r) // length * length].reshape(-1, length, r.shape[1])
         count = max(count, float(length * (bins.mean(axis=1)**2).mean() / power))
         length *= 2

@@ -58,7 +58,7 @@ OTHER_CAUSE = {
     False: 'Slip in turns, with skid steering or tracks, has this effect: then keep the setting.',
     True: 'On z, a body that rolls on its springs has this effect: then keep the setting.'}
 # advice by whether imu.lever_arm is set
-IMU_ARM = {False: 'imu.lever_arm is not set and has the same effect: set it first.',
+IMU_ARM = {False: 'An imu.lever_arm that is not set has the same effect: set it first.',
            True: 'A wrong imu.lever_arm has the same effect: check it too.'}
 
 
