@@ -202,7 +202,8 @@ def test_configured_lever_arm_only_is_to_be_measured_again(set_to, found, ratio,
 
 
 @pytest.mark.parametrize(('imu_arm', 'part'), [
-    ((0.0, 0.0, 0.0), 'imu.lever_arm is not set and'), ((1.0, 0.0, 0.0), 'A wrong imu.lever_arm')])
+    ((0.0, 0.0, 0.0), 'imu.lever_arm that is not set'),
+    ((1.0, 0.0, 0.0), 'A wrong imu.lever_arm')])
 def test_imu_lever_arm_is_named_as_the_other_cause(imu_arm, part):
     value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
     value[[CONSTANTS.index(f'odometer_lever_arm_{axis}') for axis in 'xy']] = 1.0
