@@ -94,7 +94,7 @@ def side_reasons(pair: WheelPair, width: float, sigma: float,
         return (Reason(Code.ODOMETER_CHOSEN, 'too few turns to test whether left and right wheel '
                        f'are swapped (track width from turns {width:.2f} ± {sigma:.2g} m): the '
                        'configured sides are used'),)
-    if width > -TRACK_WIDTH.least:
+    if width > 0:
         return ()
     return (Reason(Code.WHEELS_SWAPPED, f'the {pair.names[0]} wheel travels farther in left turns '
                    f'(track width {width:.2f} m, ± {sigma:.2g} m)'),)

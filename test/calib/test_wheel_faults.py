@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.wheel_faults import wheel_faults
+from odocal_ros.calib.wheel_pair_regression import side_reasons
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
+from odocal_ros.screening.wheel_faults import WheelPair
 
 pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
@@ -70,6 +72,15 @@ def test_swapped_wheels_are_found_by_the_gyro():
         assert [r.code for r in reasons] == [Code.WHEELS_SWAPPED]
         assert 'track width -1.' in reasons[0].text
         assert faults(options)[0] == ()
+
+
+@pytest.mark.parametrize(('width', 'sigma', 'codes'), [
+    (-0.09, 0.01, [Code.WHEELS_SWAPPED]), (0.09, 0.01, []),      # 9 sigmas, of a small robot
+    (-0.05, 0.01, [Code.ODOMETER_CHOSEN]), (0.05, 0.01, [Code.ODOMETER_CHOSEN]),
+    (-0.03, 0.01, [Code.WHEEL_DEAD]), (0.03, 0.01, [Code.WHEEL_DEAD])])
+def test_sides_are_decided_by_the_sign_of_a_significant_track_width(width, sigma, codes):
+    pair = WheelPair(*np.zeros((5, 2)), quantum=0.0)
+    assert [r.code for r in side_reasons(pair, width, sigma, 0.0)] == codes
 
 
 @pytest.mark.parametrize('swap', [False, True])
