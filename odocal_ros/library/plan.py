@@ -185,7 +185,8 @@ class Planned(Plan):
 
 
 def plan(*, distance: float | None = None, speed: float | None = None,
-         turns: int | None = None, standstill: float | None = None, acceleration: float = 1.0,
+         turns: int | None = None, standstill: float | None = None,
+         acceleration: float | None = None,
          scenario: str | None = None, duration: float | None = None,
          gpx: Path | str | None = None, bag: Path | str | None = None,
          topics: Mapping[str, str] | None = None, config: Settings = None,
@@ -194,8 +195,9 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     Predict the sigmas of one drive.
 
     distance, speed, turns, standstill, acceleration : m, m/s, number of 90 deg turns, s at rest
-    at start and end, m/s^2: a drive by its figures.   scenario, duration : name of a simulated
-    drive, and its duration, s.   gpx : a GPX track; one without times is driven at ``speed``.
+    at start and end (default 30), m/s^2 (default 1): a drive by its figures.   scenario,
+    duration : name of a simulated drive, and its duration, s.   gpx : a GPX track; one without
+    times is driven at ``speed``.
     bag, topics : a recorded bag, with the accuracy and rate of its fixes; of a journal with its
     settings and topics.   config : as ``calibrate_bag``: IMU grade, heading source and the like.
     errors : fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per
@@ -205,7 +207,9 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     """
     given = [name for name, value in {'scenario': scenario, 'gpx': gpx, 'bag': bag,
                                       'distance': distance}.items() if value is not None]
-    _check_arguments(given, speed, turns, standstill, duration)
+    _check_arguments(given, {'speed': speed, 'turns': turns, 'standstill': standstill,
+                             'acceleration': acceleration, 'duration': duration,
+                             **{f'{slot}-topic': topic for slot, topic in (topics or {}).items()}})
     from odocal_ros.library.read_bag import journal_notes
     journal = journal_notes(Path(bag)) if bag else None
     settings = config_of(config, journal.settings if journal else None)
@@ -218,27 +222,31 @@ def plan(*, distance: float | None = None, speed: float | None = None,
         drive, bag_sigmas = planned_drives.from_bag(Path(bag), settings, dict(topics or {}),
                                                     journal)
     elif speed is None:
-        raise BadUsage('--distance needs --speed, m/s')
+        raise BadUsage('--distance requires --speed, m/s')
     else:
         assert distance is not None
         drive = planned_drives.from_figures(
-            speed, distance, 30.0 if standstill is None else standstill, turns or 0, acceleration)
+            speed, distance, 30.0 if standstill is None else standstill, turns or 0,
+            1.0 if acceleration is None else acceleration)
     if 'fix' in errors:      # twice the horizontal one, unless given too
         bag_sigmas |= {'fix_up': None}
     sigmas = Sigmas(config=settings, **(bag_sigmas | errors))
     return Planned(**vars(plan_methods(drive, sigmas)), drive=drive, sigmas=sigmas)
 
 
-def _check_arguments(given: list[str], speed: float | None, turns: int | None,
-                     standstill: float | None, duration: float | None) -> None:
-    """Raise BadUsage for arguments that do not fit; given: the names of those of a drive."""
+def _check_arguments(given: list[str], others: dict[str, Any]) -> None:
+    """Raise BadUsage if the arguments that give a drive are not one, or do not fit ``others``."""
     if len(given) != 1:
         raise BadUsage('plan: give one drive: --scenario NAME, --gpx FILE, --bag BAG, or '
                        f'--distance with --speed{"; not " if given else ""}'
                        f'{" and ".join("--" + name for name in given)}')
-    if duration is not None and given != ['scenario']:
-        raise BadUsage('--duration requires --scenario; otherwise distance and speed give it')
-    if given != ['distance'] and (standstill is not None or turns is not None):
-        raise BadUsage(f'--standstill and --turns require --distance, not --{given[0]}')
+    required = {'speed': ('distance', 'gpx'), 'turns': ('distance',), 'standstill': ('distance',),
+                'acceleration': ('distance',), 'duration': ('scenario',)}
+    for name, value in others.items():
+        drives = required.get(name, ('bag',))      # otherwise a topic
+        if value is not None and given[0] not in drives:
+            raise BadUsage(f'--{name} requires {" or ".join(f"--{drive}" for drive in drives)}, '
+                           f'not --{given[0]}')
+    speed = others['speed']
     if speed is not None and not (math.isfinite(speed) and speed > 0):
         raise BadUsage(f'--speed {speed:g}: required: a number above 0')

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--scenario', metavar='NAME', help='scenario of odocal simulate, such as town; '
         'a robot indoors: --indoor')
     add('--duration', type=float, metavar='S', help='duration of the scenario, s')
-    add('--gpx', metavar='FILE', help='GPX track (needs --speed if it has no times)')
+    add('--gpx', metavar='FILE', help='GPX track (requires --speed if it has no times)')
     add('--bag', metavar='BAG', help='recorded bag, with its own fix accuracy and rate')
     add('--distance', type=float, metavar='M', help='length of a drive, m, with --speed')
     add('--speed', type=float, metavar='M/S', help='speed of the drive')
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '30)')
     add('--turns', type=int, metavar='N', help='number of 90 deg turns, alternating left and '
         'right (default 0)')
-    add('--acceleration', type=float, default=1.0, metavar='M/S2', help='default 1')
+    add('--acceleration', type=float, metavar='M/S2', help='default 1')
     add('--imu-grade', metavar='GRADE', help='consumer, industrial, tactical or navigation')
     add('--heading-source', metavar='SOURCE', help='auto, gyrocompass, imu_orientation, '
         'heading_topic, course or fixed (default: fixed with --heading-sigma-deg, else auto)')

@@ -19,7 +19,7 @@ SIGNATURES = {
     'read_bag': '(path, topics=None, config=None, *, listener=None)',
     'simulate': "(scenario='town', out=None, *, storage='mcap', compression='none', force=False, "
                 'heading_sigma=None, progress=None, **options)',
-    'plan': '(*, distance=None, speed=None, turns=None, standstill=None, acceleration=1.0, '
+    'plan': '(*, distance=None, speed=None, turns=None, standstill=None, acceleration=None, '
             'scenario=None, duration=None, gpx=None, bag=None, topics=None, config=None, '
             '**errors)',
     'compare': '(*calibrations)'}
