@@ -218,9 +218,9 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
 
 
 def _section_text(leg: Leg, part: LegResult, count: int) -> str:
-    """Return the span of one of ``count`` parts of a leg, as text."""
+    """Return the span of one of ``count`` usable parts of a leg, as text."""
     begin, end = ((t - leg.start_ns) * 1e-9 for t in (part.start_ns, part.stop_ns))
     return (f'this section covers {begin:.1f} to {end:.1f} s of the '
             f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s leg'
-            + (f', one of {count} sections' if count > 1 else
-               ', the only section long enough to calibrate'))
+            + (f', one of {count} usable sections' if count > 1 else
+               ', the only section with a usable result'))

@@ -29,10 +29,10 @@ SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bi
           'warming', 'imu_arm_error', 'odometer_arm_error', 'antenna_arm_error',
           'receiver_odometer', 'sideslip', 'squat', 'body_roll', 'crossfall', 'kneeling',
           'tunnel_odometer', 'tunnel_heading', 'odometer_clock_rate', 'fix_clock_rate')
-PAIRS = {'slow_errors': 'sigma and correlation time, such as ((1.2,60),(0.9,900))',
-         'tunnels': 'begin and length, such as ((200,60),(400,30))'}
+PAIRS = {'slow_errors': ('sigma', 'correlation time', '((1.2,60),(0.9,900))'),
+         'tunnels': ('begin', 'length', '((200,60),(400,30))')}
 POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor',
-            'receiver_odometer_time', 'imu_batch', 'burst_onset', 'kerb_distance',
+            'receiver_odometer_time', 'burst_onset', 'kerb_distance',
             'cross_slope_length')
 
 
@@ -155,9 +155,13 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
     """Return the numbers of a parameter, or raise BadUsage for a wrong form."""
     if name in PAIRS:
-        if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
-                                                 and v[1] for v in value)):
-            raise BadUsage(f'--real {name}: required: pairs of {PAIRS[name]}')
+        first, second, example = PAIRS[name]
+        if not (isinstance(value, tuple)
+                and all(isinstance(v, tuple) and len(v) == 2 for v in value)):
+            raise BadUsage(f'--real {name}: required: pairs of {first} and {second}, such as '
+                           f'{example}')
+        if not all(v[1] for v in value):
+            raise BadUsage(f'--real {name}: the {second} is 0; required: above 0')
         return tuple(x for pair in value for x in pair)
     count = 3 if default is None else len(default) if isinstance(default, tuple) else 0
     if isinstance(value, tuple) != bool(count) or count and len(value) != count:

@@ -92,6 +92,19 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
             one.methods['smoother'].estimates[name].sigma for one in results), name
 
 
+def test_the_only_usable_section_is_not_called_the_only_long_one(made, monkeypatch):
+    leg, config = made.leg(), settings(made, method='two_point')
+
+    def first_rejected(part, *args, **options):
+        result = calibrate(part, *args, **options)
+        is_first = part.start_ns == leg.start_ns
+        return replace(result, methods={}) if is_first else result
+
+    monkeypatch.setattr('odocal_ros.pipeline.calibrate.calibrate', first_rejected)
+    (only,) = calibrate_parts(silent(leg, GAP), config)
+    assert only.reasons[-1].text.endswith(', the only section with a usable result')
+
+
 def test_a_leg_whose_parts_are_all_too_short_is_rejected_as_a_whole(made):
     config = settings(made, heading_sigma=None, method='smoother')
     stop = (made.leg().stop_ns - made.leg().start_ns) * 1e-9
