@@ -17,7 +17,6 @@ import zlib
 import numpy as np
 
 from odocal_ros.bagio import encode
-from odocal_ros.bagio.encode import Topic
 from odocal_ros.bagio.rosbags_readers import require_rosbags
 from odocal_ros.errors import BadUsage
 
@@ -26,7 +25,7 @@ COMPRESSIONS = ('none', 'message', 'file', 'storage')   # all zstd
 BLOCK_MESSAGES, BLOCK_BYTES = 20_000, 2**26      # judgement: packed at a time, to bound memory
 
 
-def drive_topics(drive: Any) -> list[Topic]:
+def drive_topics(drive: Any) -> list[encode.Topic]:
     """Return a simulated drive's topics, with the names of the node's inputs."""
     reference = drive.reference
     position = () if reference.encoder == 'fix' else (drive.positions(),)
@@ -49,7 +48,7 @@ def drive_topics(drive: Any) -> list[Topic]:
     return topics + [topic for topic in others if len(topic.time_ns)]
 
 
-def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
+def write_bag(path: Path, topics: Sequence[encode.Topic], storage: str = 'mcap',
               compression: str = 'none', force: bool = False,
               progress: Callable[[float], None] | None = None) -> Path:
     """
@@ -105,7 +104,7 @@ def _is_bag(path: Path) -> bool:
         p.name == 'metadata.yaml' or p.suffix in suffixes for p in path.iterdir())
 
 
-def _write(path: Path, topics: Sequence[Topic], storage: str, compression: str,
+def _write(path: Path, topics: Sequence[encode.Topic], storage: str, compression: str,
            progress: Callable[[float], None] | None) -> None:
     with require_rosbags('writing a bag'):
         from rosbags import rosbag1
@@ -142,7 +141,7 @@ def _with_checksums(storage: Any) -> None:
     storage.close_chunk = close_with_checksum
 
 
-def _merged(topics: Sequence[Topic],
+def _merged(topics: Sequence[encode.Topic],
             progress: Callable[[float], None] | None) -> Iterator[tuple[int, int, bytes]]:
     """Yield (index of the topic, bag time, message) in order of time, packed in blocks."""
     order = np.argsort(np.concatenate([t.time_ns for t in topics]), kind='stable')
@@ -164,7 +163,7 @@ def _merged(topics: Sequence[Topic],
             progress(min(1.0, (first + block) / len(by_time)))
 
 
-def _messages(topic: Topic, rows: slice) -> Iterator[tuple[int, bytes]]:
+def _messages(topic: encode.Topic, rows: slice) -> Iterator[tuple[int, bytes]]:
     packed = topic.pack(rows)
     raw, size = packed.tobytes(), packed.itemsize
     for offset, time_ns in zip(range(0, len(raw), size), topic.time_ns[rows].tolist(),

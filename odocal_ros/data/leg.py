@@ -12,27 +12,17 @@ import numpy as np
 from odocal_ros.data import samples
 from odocal_ros.data.arrays import Ints, map_rows, runs
 from odocal_ros.data.inputs import EXTERNAL_SLOTS, INPUTS, WHEELS
-from odocal_ros.data.samples import (
-    FixSamples,
-    ImuSamples,
-    OdometerForm,
-    OdometerSamples,
-    OtherImuSamples,
-    Samples,
-    SomeSamples,
-    take,
-)
 from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
 
 MAX_DAYS = 7          # judgement: of a leg
 # slot -> function that returns samples without rows
-MAKE_EMPTY: dict[str, Callable[[], Samples]] = {
-    'imu_other': OtherImuSamples.empty,
+MAKE_EMPTY: dict[str, Callable[[], samples.Samples]] = {
+    'imu_other': samples.OtherImuSamples.empty,
     **{slot: getattr(samples, source.sample_class).empty for slot, source in INPUTS.items()}}
 SLOTS = tuple(MAKE_EMPTY)
 OTHER_SLOTS = (*WHEELS[2:], *EXTERNAL_SLOTS)      # definition: slots without a field in ``Leg``
-COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
+COUNTER = samples.OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +38,14 @@ class Leg:
 
     start_ns: int
     stop_ns: int
-    imu: ImuSamples = field(default_factory=ImuSamples.empty)
-    imu_other: OtherImuSamples = field(default_factory=OtherImuSamples.empty)
-    odometer: OdometerSamples = field(default_factory=OdometerSamples.empty)
-    odometer_right: OdometerSamples = field(default_factory=OdometerSamples.empty)
-    fix: FixSamples = field(default_factory=FixSamples.empty)
-    others: Mapping[str, Samples] = field(default_factory=dict)      # of OTHER_SLOTS, by slot
-    form: OdometerForm = COUNTER
-    form_right: OdometerForm | None = None
+    imu: samples.ImuSamples = field(default_factory=samples.ImuSamples.empty)
+    imu_other: samples.OtherImuSamples = field(default_factory=samples.OtherImuSamples.empty)
+    odometer: samples.OdometerSamples = field(default_factory=samples.OdometerSamples.empty)
+    odometer_right: samples.OdometerSamples = field(default_factory=samples.OdometerSamples.empty)
+    fix: samples.FixSamples = field(default_factory=samples.FixSamples.empty)
+    others: Mapping[str, samples.Samples] = field(default_factory=dict)   # of OTHER_SLOTS, by slot
+    form: samples.OdometerForm = COUNTER
+    form_right: samples.OdometerForm | None = None
 
     @property
     def wheel_slots(self) -> tuple[str, ...]:
@@ -67,13 +57,13 @@ class Leg:
         rows = self.others.get(slot) if slot in OTHER_SLOTS else getattr(self, slot)
         return MAKE_EMPTY[slot]() if rows is None else rows
 
-    def with_rows(self, **rows: Samples) -> 'Leg':
+    def with_rows(self, **rows: samples.Samples) -> 'Leg':
         """Return the leg with other samples in some slots."""
         others = {slot: rows.pop(slot) for slot in OTHER_SLOTS if slot in rows}
         changed: dict[str, Any] = {'others': {**self.others, **others}, **rows}
         return replace(self, **changed)
 
-    def form_of(self, slot: str) -> OdometerForm:
+    def form_of(self, slot: str) -> samples.OdometerForm:
         """Return the meaning of the values of a wheel."""
         return self.form_right or self.form if slot == WHEELS[1] else self.form
 
@@ -85,9 +75,9 @@ class LegRecorder:
     def __init__(self) -> None:
         self._rows = {slot: Rows(make_empty) for slot, make_empty in MAKE_EMPTY.items()}
         self.form = COUNTER
-        self.form_right: OdometerForm | None = None
+        self.form_right: samples.OdometerForm | None = None
 
-    def feed(self, slot: str, block: Samples) -> None:
+    def feed(self, slot: str, block: samples.Samples) -> None:
         """Append a block (one row or many) to a slot of SLOTS."""
         if len(block.stamp_ns):
             self._rows[slot].feed(block)
@@ -149,7 +139,7 @@ def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
     lead_ns = 10**9
     rows = {slot: _cut(leg.rows(slot), first_ns - lead_ns, stop_ns) for slot in SLOTS}
     imu = rows['imu']
-    rows['imu'] = take(imu, (imu.stamp_ns >= first_ns) & (imu.stamp_ns <= stop_ns))
+    rows['imu'] = samples.take(imu, (imu.stamp_ns >= first_ns) & (imu.stamp_ns <= stop_ns))
     return replace(leg, start_ns=start_ns, stop_ns=stop_ns).with_rows(**rows)
 
 
@@ -158,7 +148,7 @@ def _stamp_or_arrival(stamp_ns: Ints, received_ns: Ints) -> Ints:
     return np.where(stamp_ns > 0, stamp_ns, received_ns)
 
 
-def _cut(rows: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
+def _cut(rows: samples.SomeSamples, first_ns: int, stop_ns: int) -> samples.SomeSamples:
     """Return the rows between two stamps, and up to the first one after them."""
     time_ns = map_rows(_stamp_or_arrival, rows.stamp_ns, rows.received_ns)
     max_ns = stop_ns + 600 * 10**9    # later rows have no information on the mark
@@ -168,4 +158,4 @@ def _cut(rows: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
     if keep.all():
         return rows
     spans = runs(keep)      # one if rows are in order of time: a slice is then a view, not a copy
-    return take(rows, slice(*spans[0]) if len(spans) == 1 else keep)
+    return samples.take(rows, slice(*spans[0]) if len(spans) == 1 else keep)

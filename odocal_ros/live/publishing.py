@@ -25,7 +25,6 @@ from odocal_ros.calib.result import Calibration, wheel_factors
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import status_keys
 from odocal_ros.live import answers, params
-from odocal_ros.live.answers import hint_action_first
 from odocal_ros.live.console import losses_text
 from odocal_ros.live.health import Health
 from odocal_ros.live.messages import LATCHED
@@ -267,7 +266,7 @@ class Publishing:
     def show_status(self, view: SessionView) -> DiagnosticArray:
         array = self._array([calibration_status(view)])
         # the hint first: receivers of the status then have it
-        self._show(self._hint, String(data=hint_action_first(view)))
+        self._show(self._hint, String(data=answers.hint_action_first(view)))
         self._status.publish(array)
         for name, publisher in self._plotted.items():
             self._show(publisher, Float64(data=current_value(view, name)))

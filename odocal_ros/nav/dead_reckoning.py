@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 
 from odocal_ros.data.arrays import chunks, Floats, running_sum, work_array
 from odocal_ros.nav import geodesy
-from odocal_ros.nav.geodesy import C_en, gravity, MIN_GNSS_MOTION
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.nav.time_series import robust_sigma
@@ -124,7 +123,7 @@ def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
-                min_chord: float = MIN_GNSS_MOTION) -> float | None:
+                min_chord: float = geodesy.MIN_GNSS_MOTION) -> float | None:
     """
     Return metres per unit of travel from distances between fixes, None without motion.
 
@@ -176,7 +175,7 @@ def level_track(travel: Floats, turn: Floats) -> Floats:
 def gravity_n(position_n: Floats, origin: Origin) -> Floats:
     """Return gravity at positions in n, as a vector in n: (N, 3) m/s^2."""
     latitude, longitude, height = origin.to_geodetic(position_n).T
-    up_e = C_en(latitude, longitude)[..., 2]
-    down: Floats = -gravity(latitude, height)[:, None] * (
-        up_e @ C_en(origin.latitude, origin.longitude))
+    up_e = geodesy.C_en(latitude, longitude)[..., 2]
+    down: Floats = -geodesy.gravity(latitude, height)[:, None] * (
+        up_e @ geodesy.C_en(origin.latitude, origin.longitude))
     return down

@@ -18,14 +18,6 @@ from odocal_ros.calib.wheel_search.minimisation import (
     refine,
 )
 from odocal_ros.calib.wheel_search.parameter_sets import parameter_sets, search_ranges, Space
-from odocal_ros.calib.wheel_search.planar import (
-    course_pieces,
-    HUBER,
-    loss,
-    PlanarLeg,
-    score,
-    weights,
-)
 from odocal_ros.settings.config import WheelsConfig
 
 FREE, HELD = Space(fixed_difference=False), Space(fixed_difference=True)
@@ -38,7 +30,7 @@ def test_distances_equal_those_of_the_source_summed_step_by_step(monkeypatch):
     rng = np.random.default_rng(1)
     steps, yaw = rng.uniform(0.1, 0.3, (40, 2)), np.cumsum(rng.normal(0, 0.2, 40))
     path = np.cumsum(steps * np.exp(1j * yaw)[:, None], axis=0)
-    leg = PlanarLeg(np.arange(40.0), plane(path[:, 0]), plane(path[:, 1]),
+    leg = planar.PlanarLeg(np.arange(40.0), plane(path[:, 0]), plane(path[:, 1]),
                     rng.normal(0.0, 3.0, (40, 2)), np.array([5.0, -3.0]), np.ones(40), 1.0, 1.0)
     sets, d = np.array([[1.0, 1.0, 0.0], [1.1, 0.9, 0.4], [0.9, 1.0, -2.0]]), np.empty((3, 40))
     for k, (a, b, h) in enumerate(sets):
@@ -47,9 +39,9 @@ def test_distances_equal_those_of_the_source_summed_step_by_step(monkeypatch):
             ds = (a * steps[n, 0] + b * steps[n, 1]) / 2      # equation (ii)
             x, y = x + ds * np.cos(yaw[n] + h), y + ds * np.sin(yaw[n] + h)     # (i)
             d[k, n] = np.hypot(x - leg.fixes_n[n, 0], y - leg.fixes_n[n, 1])
-    whole = score(leg, sets)
+    whole = planar.score(leg, sets)
     monkeypatch.setattr(planar, 'CHUNK', len(leg.t))
-    for found in (whole, score(leg, sets)):
+    for found in (whole, planar.score(leg, sets)):
         assert_allclose(found.max, d.max(axis=1), rtol=1e-12)
         assert_allclose(found.mean, d.mean(axis=1), rtol=1e-12)
         assert_allclose(found.rms, np.sqrt((d**2).mean(axis=1)), rtol=1e-12)
@@ -63,10 +55,10 @@ def test_only_the_true_set_fits_perfect_fixes():
     true = np.array([[*made.truth.wheel_scales, 0.0]])
     # trapezoid rule over 20 ms; 20 ms rows with linear travel between: acceleration * dt^2 / 8
     # at each of fewer than 50 changes of acceleration, and turns of 0.4 rad/s at 12 m/s
-    assert score(leg, true).max[0] < 0.02
-    assert score(leg, leg.start).max[0] > 1.0
+    assert planar.score(leg, true).max[0] < 0.02
+    assert planar.score(leg, leg.start).max[0] > 1.0
     without = replace(leg, lever_n=np.zeros((1, 2)))
-    assert score(without, true).max[0] > 0.5
+    assert planar.score(without, true).max[0] > 0.5
 
 
 def test_fixes_beyond_the_tracks_are_left_out():
@@ -79,22 +71,22 @@ def test_fixes_beyond_the_tracks_are_left_out():
 def test_course_difference_equals_the_rotation_of_the_track():
     leg = on_a_plane(sigma=0.0)
     off = np.deg2rad([0.0, 3.0, -20.0])
-    found = score(leg, TRUE + off[:, None] * [0.0, 0.0, 1.0])
+    found = planar.score(leg, TRUE + off[:, None] * [0.0, 0.0, 1.0])
     assert_allclose(found.course_mean, off, atol=1e-12)
     assert_allclose(found.course_rms, np.abs(off), atol=1e-12)
-    assert score(leg, TRUE + [0.0, 0.0, 2 * np.pi]).course_rms[0] < 1e-12
-    half_turned = score(leg, TRUE + [0.0, 0.0, np.pi - 1e-9])
+    assert planar.score(leg, TRUE + [0.0, 0.0, 2 * np.pi]).course_rms[0] < 1e-12
+    half_turned = planar.score(leg, TRUE + [0.0, 0.0, np.pi - 1e-9])
     assert abs(half_turned.course_mean[0]) == pytest.approx(np.pi)
     assert half_turned.course_rms[0] == pytest.approx(np.pi)
-    still = replace(leg, pieces=course_pieces(np.zeros((50, 2)), np.ones(50)))
-    assert score(still, TRUE).row(0)['course_mean_deg'] is None
+    still = replace(leg, pieces=planar.course_pieces(np.zeros((50, 2)), np.ones(50)))
+    assert planar.score(still, TRUE).row(0)['course_mean_deg'] is None
 
 
 def test_course_uses_a_path_length_that_fixes_can_resolve():
     line = np.stack([np.arange(0.0, 400.0), np.zeros(400)], -1)
-    assert np.diff(course_pieces(line, np.full(400, 0.02))).tolist() == [[10]] * 39
-    assert np.diff(course_pieces(line, np.full(400, 1.5))).tolist() == [[30]] * 13
-    assert course_pieces(line[:0], np.empty(0)).shape == (0, 2)
+    assert np.diff(planar.course_pieces(line, np.full(400, 0.02))).tolist() == [[10]] * 39
+    assert np.diff(planar.course_pieces(line, np.full(400, 1.5))).tolist() == [[30]] * 13
+    assert planar.course_pieces(line[:0], np.empty(0)).shape == (0, 2)
 
 
 def test_weights_are_those_of_the_huber_loss():
@@ -103,11 +95,11 @@ def test_weights_are_those_of_the_huber_loss():
     for robust in (False, True):
         for k in range(len(d2)):
             more = d2 + step * (np.arange(5) == k)
-            rise = (loss(more[None], sigma, robust) - loss(d2[None], sigma, robust))[0] / step
-            assert rise * 5 == pytest.approx(weights(d2, sigma, robust)[k], rel=1e-4)
+            (rise,) = np.diff([planar.loss(x[None], sigma, robust)[0] for x in (d2, more)]) / step
+            assert rise * 5 == pytest.approx(planar.weights(d2, sigma, robust)[k], rel=1e-4)
     # beyond HUBER sigmas the influence, weight times distance, is constant
-    far = weights(np.array([1e2, 1e4]), np.ones(2), True) * [10.0, 100.0]
-    assert_allclose(far, HUBER)
+    far = planar.weights(np.array([1e2, 1e4]), np.ones(2), True) * [10.0, 100.0]
+    assert_allclose(far, planar.HUBER)
 
 
 def test_quadratic_is_fitted_exactly_and_a_cubic_shows_as_lack_of_fit():
@@ -153,8 +145,9 @@ def test_surface_and_least_squares_agree(name, space, robust):
     assert direct.converged
 
     def surface_of(x, half, robust):
-        return refine(lambda x: score(leg, parameter_sets(leg, x), robust, course=False).loss, x,
-                      replace(RANGES, half_range=half).step, half, space)
+        return refine(
+            lambda x: planar.score(leg, parameter_sets(leg, x), robust, course=False).loss, x,
+            replace(RANGES, half_range=half).step, half, space)
 
     begin = surface_of(np.zeros(3), RANGES.half_range, False)
     found = surface_of(begin.x, begin.half_range, robust)

@@ -13,15 +13,6 @@ import numpy as np
 import pytest
 
 from odocal_ros.data import arrays, samples as s, spool
-from odocal_ros.data.arrays import (
-    CHUNK_ROWS,
-    lengths,
-    median,
-    medians,
-    reduce_columns,
-    release_mapped_memory,
-    thinned,
-)
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import ImuSamples, take
 from odocal_ros.errors import BadData
@@ -97,14 +88,14 @@ def wild(*shape):
 def test_across_equals_the_reduction_by_numpy(ufunc, columns):
     x = np.abs(wild(1000, columns))
     x = x > 1 if ufunc in (np.logical_and, np.logical_or) else x
-    np.testing.assert_array_equal(reduce_columns(ufunc, x), ufunc.reduce(x, axis=1))
+    np.testing.assert_array_equal(arrays.reduce_columns(ufunc, x), ufunc.reduce(x, axis=1))
 
 
 @pytest.mark.parametrize('columns', [3, 4])
 def test_lengths_equal_the_row_norms_of_numpy(columns):
     x = wild(1000, columns)
     with np.errstate(over='ignore'):
-        np.testing.assert_array_equal(lengths(x), np.linalg.norm(x, axis=1))
+        np.testing.assert_array_equal(arrays.lengths(x), np.linalg.norm(x, axis=1))
 
 
 # data of which the subset gives a good, a poor or no bound of the median
@@ -116,23 +107,23 @@ UNLIKE = {'noise': lambda x: x, 'steps': np.round, 'one': np.ones_like, 'sorted'
 
 @pytest.mark.parametrize('kind', UNLIKE)
 def test_median_of_many_rows_equals_that_of_numpy(kind):
-    for n in (CHUNK_ROWS, CHUNK_ROWS + 1):
+    for n in (arrays.CHUNK_ROWS, arrays.CHUNK_ROWS + 1):
         x = UNLIKE[kind](np.random.default_rng(5).normal(size=n))
-        np.testing.assert_array_equal(median(x), np.median(x))
+        np.testing.assert_array_equal(arrays.median(x), np.median(x))
         both = np.stack([x, -x], -1)
-        np.testing.assert_array_equal(medians(both), np.median(both, axis=0))
+        np.testing.assert_array_equal(arrays.medians(both), np.median(both, axis=0))
 
 
-@pytest.mark.parametrize('rows', [0, 5, CHUNK_ROWS, 2 * CHUNK_ROWS + 100])
+@pytest.mark.parametrize('rows', [0, 5, arrays.CHUNK_ROWS, 2 * arrays.CHUNK_ROWS + 100])
 def test_evenly_spaced_rows_equal_a_slice(rows):
     x = np.arange(3 * rows).reshape(-1, 3)
-    for expected in (4, 1000, CHUNK_ROWS):
-        np.testing.assert_array_equal(thinned(x, expected), x[::max(1, rows // expected)])
+    for expected in (4, 1000, arrays.CHUNK_ROWS):
+        np.testing.assert_array_equal(arrays.thinned(x, expected), x[::max(1, rows // expected)])
 
 
 def test_an_integral_over_pieces_equals_the_integral_at_once():
     rng = np.random.default_rng(4)
-    t = np.cumsum(rng.uniform(0.5, 1.5, 2 * CHUNK_ROWS + 100))
+    t = np.cumsum(rng.uniform(0.5, 1.5, 2 * arrays.CHUNK_ROWS + 100))
     x = rng.normal(size=(len(t), 2))
     slices = (x[:-1] + x[1:]) / 2 * np.diff(t)[:, None]
     whole = np.concatenate([np.zeros((1, 2)), np.cumsum(slices, axis=0)])
@@ -166,7 +157,7 @@ def test_rows_of_a_file_equal_the_received_ones(imu):
     fed(recorder, imu, 9_050, 15_000)
     rows = copy.rows('imu')
     assert_same(rows, imu, 0, 9_050)
-    release_mapped_memory()
+    arrays.release_mapped_memory()
     assert_same(rows, imu, 0, 9_050)
     assert_same(recorder.rows('imu'), imu, 0, 15_000)
     # only the pre-roll of the next leg remains, and the copy is unchanged
@@ -183,7 +174,7 @@ def test_a_large_array_is_zero_and_can_be_released(monkeypatch):
         assert not array.any()
         assert not array.flags.owndata
         array[3:] = 1
-        release_mapped_memory()
+        arrays.release_mapped_memory()
         assert array.sum() == 997 * 5
     whole = arrays.work_array(10)
     assert whole.flags.owndata
@@ -204,10 +195,10 @@ def test_large_arrays_in_files_are_released(monkeypatch):
         return int(block) * 1024
 
     monkeypatch.setattr(arrays, 'MAX_RESIDENT_BYTES', array.nbytes)
-    release_mapped_memory()
+    arrays.release_mapped_memory()
     assert resident() == array.nbytes
     monkeypatch.setattr(arrays, 'MAX_RESIDENT_BYTES', array.nbytes - 1)
-    release_mapped_memory()
+    arrays.release_mapped_memory()
     assert resident() == 0
     assert array.sum() == len(array)
 

@@ -16,15 +16,6 @@ from odocal_ros.bagio.mcap_write import pack
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.live import journal_leg
-from odocal_ros.live.journal_leg import (
-    clear_empty,
-    folder_size,
-    journal_folders,
-    JournalPlan,
-    LegJournal,
-    lock_journal,
-    make_room,
-)
 
 SECOND = 10**9
 NAME = '2026-01-02T03-04-05Z_leg_1'
@@ -32,7 +23,7 @@ CHUNKS = 6
 
 
 def journal(root, name=NAME, limit=10**9):
-    return LegJournal(JournalPlan(1, root, name, 'a: 1\n', limit),
+    return journal_leg.LegJournal(journal_leg.JournalPlan(1, root, name, 'a: 1\n', limit),
                       {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
 
 
@@ -161,7 +152,7 @@ def test_old_empty_journals_are_removed(tmp_path):
     aged(f'{NAME}-4', JOURNAL, 'part_000000.mcap')
     aged('mine')
     (tmp_path / f'{NAME}-5').mkdir()
-    clear_empty(tmp_path)
+    journal_leg.clear_empty(tmp_path)
     assert sorted(os.listdir(tmp_path)) == [f'{NAME}-4', f'{NAME}-5', 'mine']
 
 
@@ -181,17 +172,17 @@ def test_only_the_oldest_unlocked_journals_are_removed(tmp_path):
     (tmp_path / 'calibration').mkdir()
     (tmp_path / 'calibration' / 'result').write_bytes(bytes(5000))
     (tmp_path / 'link').symlink_to(new)
-    assert journal_folders(tmp_path) == [old, middle, new]
-    assert make_room(tmp_path, 3000) == 3000
-    assert make_room(tmp_path, 3000, needed=1) == 2000
-    assert journal_folders(tmp_path) == [middle, new]
-    with lock_journal(middle):                                 # a node is writing to it
-        assert make_room(tmp_path, 1500) == 1000
-        assert journal_folders(tmp_path) == [middle]
-        assert make_room(tmp_path, 10) == 1000
-    assert make_room(tmp_path, 10) == 0
+    assert journal_leg.journal_folders(tmp_path) == [old, middle, new]
+    assert journal_leg.make_room(tmp_path, 3000) == 3000
+    assert journal_leg.make_room(tmp_path, 3000, needed=1) == 2000
+    assert journal_leg.journal_folders(tmp_path) == [middle, new]
+    with journal_leg.lock_journal(middle):      # a node is writing to it
+        assert journal_leg.make_room(tmp_path, 1500) == 1000
+        assert journal_leg.journal_folders(tmp_path) == [middle]
+        assert journal_leg.make_room(tmp_path, 10) == 1000
+    assert journal_leg.make_room(tmp_path, 10) == 0
     assert (tmp_path / 'calibration' / 'result').exists()
-    assert make_room(tmp_path / 'none', 10) == 0
+    assert journal_leg.make_room(tmp_path / 'none', 10) == 0
 
 
 def test_all_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
@@ -200,7 +191,7 @@ def test_all_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
 
     def watched(*args):
         size = write_file(*args)
-        taken.append(sum(folder_size(folder) for folder in journal_folders(tmp_path)))
+        taken.append(sum(map(journal_leg.folder_size, journal_leg.journal_folders(tmp_path))))
         return size
     monkeypatch.setattr(segments, 'write_file', watched)   # joined and single files exist
     for leg_id in range(1, 5):
@@ -211,7 +202,7 @@ def test_all_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
         assert one.error == ''
     assert len(taken) == 4 * (5 + 1 + 1)
     assert 900_000 < max(taken) <= limit
-    assert [f.name for f in journal_folders(tmp_path)][-1] == 'leg_4'
+    assert [f.name for f in journal_leg.journal_folders(tmp_path)][-1] == 'leg_4'
 
 
 def test_a_leg_larger_than_the_limit_is_kept_up_to_the_limit(tmp_path, monkeypatch):
@@ -222,8 +213,8 @@ def test_a_leg_larger_than_the_limit_is_kept_up_to_the_limit(tmp_path, monkeypat
         one.put([large(k)])
     assert 'raise journal.max_bytes' in one.error
     one.finish()
-    folder, = journal_folders(tmp_path)
-    assert folder_size(folder) <= 500_000
+    folder, = journal_leg.journal_folders(tmp_path)
+    assert journal_leg.folder_size(folder) <= 500_000
     with open_bag(folder) as bag:
         # space is reserved to join each new file with the existing ones
         assert bag.topics['/odometer'].count == 2

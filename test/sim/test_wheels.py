@@ -16,14 +16,6 @@ from odocal_ros.sim import wheels
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
-from odocal_ros.sim.wheels import (
-    effective_width,
-    robot_path,
-    SIDEWAYS,
-    SPOT_RATIO,
-    STRAIGHT_RATIO,
-    wheels_of,
-)
 
 pytestmark = pytest.mark.core
 
@@ -35,8 +27,8 @@ def robot(**options):
 def paths(made):
     """Return states in small steps, and the rolled path of each wheel by its name, m."""
     state = made.motion.at(np.arange(0.0, made.motion.duration, 0.01))
-    return state, {one.name: robot_path(state, made.options, one)
-                   for one in wheels_of(made.options)}
+    return state, {one.name: wheels.robot_path(state, made.options, one)
+                   for one in wheels.wheels_of(made.options)}
 
 
 def test_skid_wheels_turn_by_the_effective_width_on_the_spot():
@@ -45,11 +37,11 @@ def test_skid_wheels_turn_by_the_effective_width_on_the_spot():
     spot = (state.speed == 0.0) & (state.yaw_rate != 0.0)
     difference = np.diff(rolled['right_wheel_joint'] - rolled['left_wheel_joint'])
     turns = np.diff(state.turned)
-    assert effective_width(made.options) == pytest.approx(SPOT_RATIO * 0.3)
+    assert wheels.effective_width(made.options) == pytest.approx(wheels.SPOT_RATIO * 0.3)
     both = spot[:-1] & spot[1:]
-    assert_allclose(difference[both], SPOT_RATIO * 0.3 * turns[both], rtol=1e-9, atol=1e-12)
-    wide = effective_width(made.options, 1e9)
-    assert wide == pytest.approx(STRAIGHT_RATIO * 0.3)
+    assert_allclose(difference[both], wheels.SPOT_RATIO * 0.3 * turns[both], rtol=1e-9, atol=1e-12)
+    wide = wheels.effective_width(made.options, 1e9)
+    assert wide == pytest.approx(wheels.STRAIGHT_RATIO * 0.3)
 
 
 def test_mecanum_wheels_obey_their_kinematics_and_move_sideways():
@@ -59,9 +51,9 @@ def test_mecanum_wheels_obey_their_kinematics_and_move_sideways():
     lateral = np.append(0.0, np.cumsum(0.01 * (state.sway[1:, 0] + state.sway[:-1, 0]) / 2))
     assert lateral.max() > 1.0
     assert_allclose((fl + fr + rl + rr) / 4, state.travel, atol=1e-9)
-    assert_allclose((-fl + fr + rl - rr) / 4, lateral / SIDEWAYS, atol=1e-9)
-    assert_allclose((-fl + fr - rl + rr) / 4, effective_width(made.options) / 2 * state.turned,
-                    atol=1e-9)
+    assert_allclose((-fl + fr + rl - rr) / 4, lateral / wheels.SIDEWAYS, atol=1e-9)
+    assert_allclose((-fl + fr - rl + rr) / 4,
+                    wheels.effective_width(made.options) / 2 * state.turned, atol=1e-9)
     made = robot(drive='mecanum', reference='mocap')
     path = np.linalg.norm(np.diff(made.positions()[:, :2][::10], axis=0), axis=1).sum()
     assert path > 1.2 * made.truth.distance
@@ -94,25 +86,26 @@ def test_a_robot_without_an_imu_has_a_readable_bag_without_imu(tmp_path):
 TOWN = SimOptions(scenario='town', duration=200.0, imu_rate=20.0, wheels=4, seed=5)
 
 
-@pytest.mark.parametrize('wheels', [1, 2, 3, 4, 6, 7, 8])
-def test_the_mean_count_times_the_scale_is_the_path(wheels):
-    options = resolved(replace(TOWN, wheels=wheels))
-    fixed = [wheel for wheel in wheels_of(options) if not wheel.steered]
+@pytest.mark.parametrize('count', [1, 2, 3, 4, 6, 7, 8])
+def test_the_mean_count_times_the_scale_is_the_path(count):
+    options = resolved(replace(TOWN, wheels=count))
+    fixed = [wheel for wheel in wheels.wheels_of(options) if not wheel.steered]
     assert np.mean([1 / wheel.scale for wheel in fixed]) == pytest.approx(1 / options.scale)
-    assert len(wheels_of(options)) == len({wheel.name for wheel in wheels_of(options)}) == wheels
+    names = [wheel.name for wheel in wheels.wheels_of(options)]
+    assert len(names) == len(set(names)) == count
 
 
-@pytest.mark.parametrize('wheels', [1, 2, 4])
-def test_wheels_without_steering_differ_by_the_turn_and_their_scale(wheels):
-    drive = simulate(replace(TOWN, front_steers=False, wheels=wheels, odometer='angle',
+@pytest.mark.parametrize('count', [1, 2, 4])
+def test_wheels_without_steering_differ_by_the_turn_and_their_scale(count):
+    drive = simulate(replace(TOWN, front_steers=False, wheels=count, odometer='angle',
                              odometer_lever_arm=(0.0, 0.7, 0.0)))
-    assert len(drive.wheels) == wheels
+    assert len(drive.wheels) == count
     assert drive.truth.scale == drive.options.scale
-    if wheels == 2:
+    if count == 2:
         left, right = drive.truth.wheel_scales
         assert right / left == pytest.approx(1 + drive.options.wheel_difference)
     state = drive.motion.at((drive.odometer.stamp_ns - drive.options.start_ns) * 1e-9)
-    for wheel, samples in zip(wheels_of(drive.options), drive.wheels, strict=True):
+    for wheel, samples in zip(wheels.wheels_of(drive.options), drive.wheels, strict=True):
         rolled = (samples.value - samples.value[0]) * wheel.scale
         np.testing.assert_allclose(
             rolled, state.travel - wheel.arm[1] * (state.turned - state.turned[0]), atol=1e-9)
@@ -122,7 +115,7 @@ def test_a_steered_wheel_rolls_along_its_own_curve():
     drive = simulate(replace(TOWN, odometer_rate=200.0, latitude=0.0, heading=np.pi / 2))
     t = np.arange(0.0, drive.options.duration, 0.001)
     state = drive.motion.at(t)
-    wheel = wheels_of(drive.options)[0]
+    wheel = wheels.wheels_of(drive.options)[0]
     along, turn = np.gradient(state.travel, t), np.gradient(state.turned, t)
     speed = np.hypot(along - wheel.arm[1] * turn, wheel.arm[0] * turn)
     path = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))
