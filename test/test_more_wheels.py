@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate
-from odocal_ros.calib.wheel_slips import join_axles, WheelSlips
+from odocal_ros.calib.slip import join_axles, WheelSlips
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.estimator.result.wheel_result import Wheel, wheel_estimates
 from odocal_ros.output.summary import screen as printed

@@ -21,7 +21,6 @@ import numpy as np
 
 from odocal_ros.calib import slip, wheel_pair_regression as regression
 from odocal_ros.calib.wheel_pair_regression import MEAN_STEPS, WHOLE_DRIVE_SIGMAS
-from odocal_ros.calib.wheel_slips import NO_SLIPS, SLIP_GRID, wheel_slip_reason, WheelSlips
 from odocal_ros.data.arrays import Bools, Floats, running_sum, runs
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
@@ -58,7 +57,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                  marks: tuple[float, float], track: Track, latitude: float,
                  metres_per_unit: float, track_width: float = 0.0,
                  uncertain_t: Floats | None = None, max_deviation: float = 0.35,
-                 wheel_count: int = 2) -> tuple[tuple[Reason, ...], WheelSlips]:
+                 wheel_count: int = 2) -> tuple[tuple[Reason, ...], slip.WheelSlips]:
     """
     Return the faults of two counting wheels by the gyro, and the slips of one of them.
 
@@ -69,15 +68,15 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     for other reasons (gaps, resets).   max_deviation : limit of the ratio of the counts minus one.
     wheel_count : number of wheels in the mean.
     """
-    pair = wheels_on_grid(axle, imu, marks, SLIP_GRID,
+    pair = wheels_on_grid(axle, imu, marks, slip.SLIP_GRID,
                           np.empty(0) if uncertain_t is None else uncertain_t)
     if pair is None or not metres_per_unit:
-        return (), NO_SLIPS
+        return (), slip.NO_SLIPS
     pair = regression.without_gyro_drift(pair)
     regressors = regression.right_path_regressors(pair, metres_per_unit)
     x, covariance = regression.fit_right_path(pair, regressors, metres_per_unit)
     if x is None or covariance is None or x[0] <= 0:
-        return (), NO_SLIPS
+        return (), slip.NO_SLIPS
     ratio = x[0]                                          # right counts over left ones
     per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
     width = track_width or abs(x[1]) * per_right
@@ -95,13 +94,13 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
         steep = 2 * abs(change) * metres_per_unit
         events = [event for event in events if abs(_slope(pair, event)) > steep]
     if not events:
-        return reasons, replace(NO_SLIPS, change=change)
+        return reasons, replace(slip.NO_SLIPS, change=change)
     mean = (pair.left * ratio + pair.right) / 2 * per_right
     begin, end, size = np.transpose(events)
     wheel = np.array([_find_wheel(pair, mean, imu, track, latitude, event) for event in events])
     # if the left wheel spins, right minus left is negative
-    slips = WheelSlips(begin, end, np.where(wheel < 0, -size, size), wheel, change)
-    return reasons + wheel_slip_reason(slips, pair.names), slips
+    slips = slip.WheelSlips(begin, end, np.where(wheel < 0, -size, size), wheel, change)
+    return reasons + slip.wheel_slip_reason(slips, pair.names), slips
 
 
 def _without_slope(pair: WheelPair, residual: Floats, quantum_m: float) -> Floats:

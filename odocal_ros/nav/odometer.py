@@ -10,8 +10,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, running_sum, runs, Values
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.coarse_speed import CoarseSpeed, HeldSpeed
-from odocal_ros.nav.speed_step import find_coarse_speed, find_held_speed
+from odocal_ros.nav import coarse_speed
 from odocal_ros.reasons import Code, Reason
 
 # judgement: a step this many times the 95th percentile of the moving rate is not motion
@@ -28,7 +27,7 @@ class Travel:
     t: Floats         # (n,) s since the start mark, rising
     s: Floats         # (n,) signed travel from the first row
     quantum: float    # size of one count, scale units; 0 for speeds and floats
-    coarse: CoarseSpeed | None = None    # measured speeds, if in steps and of one wheel
+    coarse: coarse_speed.CoarseSpeed | None = None    # measured speeds, if in steps, of one wheel
     name: str = ''         # of the wheel, '' for a single one or a mean
     # scale units, of a steered wheel from the axle that does not steer; 0: it does not steer
     distance_ahead: float = 0.0
@@ -80,11 +79,12 @@ def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: b
     if form.quantity == 'rate':
         speed = value.astype(float, copy=False)
         signed = -speed if reversed_counts else speed
-        coarse, held = find_coarse_speed(t, signed), find_held_speed(t, signed)
+        coarse = coarse_speed.find_coarse_speed(t, signed)
+        held = coarse_speed.find_held_speed(t, signed)
         # a held speed takes precedence over a finer step
         if held and (coarse is None or coarse.step < held.step / 2):
             coarse = held
-        if isinstance(coarse, HeldSpeed):
+        if isinstance(coarse, coarse_speed.HeldSpeed):
             speed = -coarse.value if reversed_counts else coarse.value
         step = (speed[:-1] + speed[1:]) / 2 * np.diff(t)
     elif form.quantity == 'increment':

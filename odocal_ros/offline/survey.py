@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.calib.drive import find_reachable, fix_white_noise, path_and_chord
 from odocal_ros.data.arrays import Floats, Ints, lengths, median, medians, reduce_columns
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.nav.speed_step import MIN_NUMBER
+from odocal_ros.nav.coarse_speed import MIN_NUMBER
 from odocal_ros.screening.fix_screen import has_position, usable_fixes
 from odocal_ros.screening.glitches import is_impossible, without_invalid_orientations
 from odocal_ros.screening.inputs import Inputs, LocatedFixes, median_origin

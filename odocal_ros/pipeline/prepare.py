@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.calib import drive
 from odocal_ros.calib.gyro_axes import check_turns
 from odocal_ros.calib.mounting import with_mounting_remedy
-from odocal_ros.calib.wheel_slips import join_axles, NO_SLIPS, WheelSlips
+from odocal_ros.calib.slip import join_axles, NO_SLIPS, WheelSlips
 from odocal_ros.data.arrays import release_mapped_memory, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.alignment import Alignment

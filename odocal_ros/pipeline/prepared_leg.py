@@ -22,8 +22,7 @@ from odocal_ros.calib.evidence import KEPT_ROWS, make_evidence
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, Path, standing_at
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.scale_variation import counter_change_reasons
-from odocal_ros.calib.slip import count_size, find_slips, Slips, SPIN_WINDOW
-from odocal_ros.calib.wheel_slips import WheelSlips
+from odocal_ros.calib.slip import count_size, find_slips, Slips, SPIN_WINDOW, WheelSlips
 from odocal_ros.data.arrays import Bools, Floats, map_rows, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav import dead_reckoning

@@ -14,7 +14,7 @@ from smoother_legs import made, smoothed
 
 from odocal_ros.calib.joint import fit_jointly
 from odocal_ros.calib.result import Estimate
-from odocal_ros.calib.wheel_slips import NO_SLIPS
+from odocal_ros.calib.slip import NO_SLIPS
 from odocal_ros.estimator import several
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.several import combine_legs

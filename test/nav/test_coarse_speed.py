@@ -8,10 +8,14 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.nav.coarse_speed import (
+    CoarseSpeed,
+    find_coarse_speed,
+    find_held_speed,
+    find_step,
+)
 from odocal_ros.nav.odometer import make_travel
 from odocal_ros.nav.receiver_filter import filter_error, MIN_LAG2, odometer_error
-from odocal_ros.nav.speed_step import find_coarse_speed, find_held_speed, find_step
 from odocal_ros.screening.odometer_rows import with_gap_uncertainty
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.wheels import held_until_step, quantized
