@@ -62,8 +62,7 @@ class RobotMotion:
     @property
     def moving(self) -> Bools:
         """Return True where the robot moves: (n + 1,)."""
-        moving: Bools = (self.speed != 0) | (self.side != 0) | (self.rate != 0)
-        return moving
+        return np.asarray((self.speed != 0) | (self.side != 0) | (self.rate != 0))
 
     @property
     def distance(self) -> float:
@@ -121,8 +120,7 @@ def _speed_profile(length: float, top: float, acceleration: float) -> Floats:
     ramp, duration = top / acceleration, length / top + top / acceleration
     t = MOTION_STEP * np.arange(1, max(2, math.ceil(duration / MOTION_STEP)) + 1)
     share_of_top = np.clip(np.minimum(t / ramp, (t[-1] + MOTION_STEP - t) / ramp), 0, 1)
-    profile: Floats = share_of_top / (share_of_top.sum() * MOTION_STEP)
-    return profile
+    return np.asarray(share_of_top / (share_of_top.sum() * MOTION_STEP))
 
 
 def _pattern_moves(name: str, size: float) -> list[Move]:
@@ -289,8 +287,7 @@ def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> Metho
 def _fixes_at_rests(t_fix: Floats, motion: RobotMotion) -> Ints:
     """Return the indices of the fixes nearest to the middle of each rest; t_fix from the start."""
     middle = motion.rests.mean(axis=1) - motion.t[np.argmax(motion.moving) - 1]
-    nearest: Ints = np.abs(t_fix[:, None] - middle).argmin(axis=0)
-    return nearest
+    return np.asarray(np.abs(t_fix[:, None] - middle).argmin(axis=0))
 
 
 def predict_robot(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:

@@ -199,8 +199,7 @@ def _used_points(points: Floats, path: Path) -> Ints:
 def _moving_mean(x: Floats, window: int) -> Floats:
     """Return means over an odd number of rows; the end values are extended: (n,)."""
     total = np.concatenate([[0.0], np.cumsum(np.pad(x, window // 2, mode='edge'))])
-    mean: Floats = (total[window:] - total[:-window]) / window
-    return mean
+    return np.asarray((total[window:] - total[:-window]) / window)
 
 
 def from_bag(path: Path, config: Config, topics: dict[str, str],

@@ -62,8 +62,7 @@ def _stack_fits(result: Calibration,
 
 def _at_track(smoothed: dict[str, Any], column: Floats) -> Floats:
     """Return the rows of a column by keyframe at the times of the stored track."""
-    rows: Floats = column[np.searchsorted(smoothed['key_t'], smoothed['track_t'])]
-    return rows
+    return np.asarray(column[np.searchsorted(smoothed['key_t'], smoothed['track_t'])])
 
 
 def _vehicle_attitude(leg: LegResult, smoothed: dict[str, Any]) -> Floats:

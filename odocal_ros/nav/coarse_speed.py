@@ -151,8 +151,7 @@ def _rate_limits(t: Floats, edge: Floats, step: float) -> Floats:
         return np.full(len(t), np.inf)      # a single change gives no rate
     between = np.maximum(np.abs(np.diff(edge)), step) / np.diff(t)
     rate = np.maximum(np.r_[0.0, between], np.r_[between, 0.0])
-    limits: Floats = np.maximum(rate, np.percentile(rate, 75))
-    return limits
+    return np.asarray(np.maximum(rate, np.percentile(rate, 75)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -176,6 +176,5 @@ def gravity_n(position_n: Floats, origin: Origin) -> Floats:
     """Return gravity at positions in n, as a vector in n: (N, 3) m/s^2."""
     latitude, longitude, height = origin.to_geodetic(position_n).T
     up_e = geodesy.C_en(latitude, longitude)[..., 2]
-    down: Floats = -geodesy.gravity(latitude, height)[:, None] * (
-        up_e @ geodesy.C_en(origin.latitude, origin.longitude))
-    return down
+    return np.asarray(-geodesy.gravity(latitude, height)[:, None] * (
+        up_e @ geodesy.C_en(origin.latitude, origin.longitude)))

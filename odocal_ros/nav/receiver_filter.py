@@ -113,8 +113,7 @@ class _Track:
         k, s, p = self._cubic(times)
         rate = self.velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
         steady = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
-        mean: Floats = steady + transient[k] * np.exp(-np.maximum(s, 0.0) / tau)
-        return mean
+        return np.asarray(steady + transient[k] * np.exp(-np.maximum(s, 0.0) / tau))
 
 
 def _tracking_error(t: Floats, position: Floats, velocity: Floats, times: Floats,
@@ -135,15 +134,13 @@ def _tracking_error(t: Floats, position: Floats, velocity: Floats, times: Floats
         transient[m] += transition[m] @ transient[m - 1]
     k = np.clip(np.searchsorted(t, times, side='right') - 1, 0, len(T) - 1)
     s = (times - t[k])[:, None]
-    error: Floats = forced_response(k, s)[:, 0] + np.einsum(
-        'ki,kij->kj', _transition_matrices(np.maximum(s[:, 0], 0.0), tau)[:, 0], transient[k])
-    return error
+    return np.asarray(forced_response(k, s)[:, 0] + np.einsum(
+        'ki,kij->kj', _transition_matrices(np.maximum(s[:, 0], 0.0), tau)[:, 0], transient[k]))
 
 
 def _transition_matrices(s: Floats, tau: float) -> Floats:
     """Return transition matrices of an error and its derivative over s: (k, 2, 2)."""
     w = np.sqrt(0.5) / tau      # decay rate and frequency at a damping of sqrt(1/2)
     decay, sine, cosine = np.exp(-w * s), np.sin(w * s), np.cos(w * s)
-    out: Floats = decay[:, None, None] * np.stack([
-        np.stack([cosine + sine, sine / w], -1), np.stack([-2 * w * sine, cosine - sine], -1)], 1)
-    return out
+    return np.asarray(decay[:, None, None] * np.stack([
+        np.stack([cosine + sine, sine / w], -1), np.stack([-2 * w * sine, cosine - sine], -1)], 1))

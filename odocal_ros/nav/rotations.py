@@ -56,8 +56,8 @@ def exp_so3(phi: Floats) -> Floats:
     """Return the rotation matrix of rotation vector phi, rad: (..., 3) to (..., 3, 3)."""
     half = np.linalg.norm(phi, axis=-1)[..., None, None] / 2
     S = skew(phi)
-    C: Floats = np.eye(3) + np.sinc(2 * half / np.pi) * S + np.sinc(half / np.pi) ** 2 / 2 * S @ S
-    return C
+    return np.asarray(np.eye(3) + np.sinc(2 * half / np.pi) * S
+                      + np.sinc(half / np.pi) ** 2 / 2 * S @ S)
 
 
 def rotvec(C: Floats) -> Floats:
@@ -76,21 +76,18 @@ def transpose(C: Floats) -> Floats:
 
 def rotate(C: Floats, vectors: Floats) -> Floats:
     """Return C @ v row by row: (K, 3, 3), (K, 3)."""
-    out: Floats = np.einsum('kij,kj->ki', C, vectors)
-    return out
+    return np.asarray(np.einsum('kij,kj->ki', C, vectors))
 
 
 def rotate_back(C: Floats, vectors: Floats) -> Floats:
     """Return the inverse of ``rotate``: (K, 3, 3), (K, 3)."""
-    out: Floats = np.einsum('kij,ki->kj', C, vectors)
-    return out
+    return np.asarray(np.einsum('kij,ki->kj', C, vectors))
 
 
 def level_left(forward_n: Floats) -> Floats:
     """Return the level unit axes to the left of forward axes in n: (K, 3)."""
     left = np.stack([-forward_n[:, 1], forward_n[:, 0], np.zeros(len(forward_n))], -1)
-    out: Floats = left / np.linalg.norm(left, axis=1, keepdims=True)
-    return out
+    return np.asarray(left / np.linalg.norm(left, axis=1, keepdims=True))
 
 
 def quat_from_rotvec(phi: ArrayLike) -> Floats:

@@ -68,8 +68,7 @@ def _wheels_at_rest(middle: Floats, travel: Travel, metres_per_unit: float) -> B
     # range of the travel at a few times in the window, so that rocking is detected
     probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
     distance = np.max(probes, axis=0) - np.min(probes, axis=0)
-    at_rest: Bools = distance * metres_per_unit <= _travel_limit(travel, metres_per_unit)
-    return at_rest
+    return np.asarray(distance * metres_per_unit <= _travel_limit(travel, metres_per_unit))
 
 
 def _steady_rates(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:

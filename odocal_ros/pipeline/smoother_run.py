@@ -116,8 +116,7 @@ def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
         np.array([value if (e := estimates[f'{name}_lever_arm_{axis}']).value is None else e.value
                   for axis, value in zip('xyz', section.lever_arm, strict=True)])
         for name, section in (('antenna', config.gnss), ('odometer', config.odometer)))
-    arm: Floats = antenna - odometer
-    return arm
+    return np.asarray(antenna - odometer)
 
 
 def planar_input(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:

@@ -123,8 +123,7 @@ def repeated_counts(value: Values, modulus: int) -> Bools:
     intervals_to_update = np.floor(rows_to_update / np.mean(interval_rows[is_moving]))
     intervals_to_update[np.r_[False, is_moving, False][next_update]] = 0.0
     same_interval = np.append(intervals_to_update[1:] == intervals_to_update[:-1], False)
-    repeated: Bools = np.append(False, size == 0) & same_interval
-    return repeated
+    return np.asarray(np.append(False, size == 0) & same_interval)
 
 
 def _fits_adjacent_rates(t: Floats, travel: float, rate: Floats, first: int, last: int) -> bool:

@@ -246,5 +246,4 @@ def turn_rate(state: State) -> Floats:
     """Return the turn rate about the vehicle's up axis relative to the ground, rad/s: (n,)."""
     east = state.speed * np.cos(state.slope) * np.cos(state.yaw)
     level_turn = east * np.tan(state.latitude) / (geodesy.radii(state.latitude)[1] + state.height)
-    turn: Floats = state.yaw_rate * np.cos(state.slope) + level_turn
-    return turn
+    return np.asarray(state.yaw_rate * np.cos(state.slope) + level_turn)

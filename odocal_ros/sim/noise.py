@@ -24,8 +24,7 @@ def make_rng(seed: int, name: str) -> np.random.Generator:
 def white(rng: np.random.Generator, root_psd: float, rate: float,
           shape: tuple[int, int]) -> Floats:
     """Return samples at ``rate`` Hz of white noise of a root PSD, unit/sqrt(Hz)."""
-    noise: Floats = root_psd * rate**0.5 * rng.standard_normal(shape)
-    return noise
+    return np.asarray(root_psd * rate**0.5 * rng.standard_normal(shape))
 
 
 def random_walk(rng: np.random.Generator, root_rate: float, rate: float,

@@ -127,8 +127,7 @@ def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floa
     weight = np.full(len(f), 2.0)
     weight[0] = 1.0
     weight[-1] = 1.0 if n % 2 == 0 else 2.0
-    acceleration: Floats = rms * x / np.sqrt((weight * power).sum() / n)
-    return acceleration
+    return np.asarray(rms * x / np.sqrt((weight * power).sum() / n))
 
 
 def delayed_stamps(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,

@@ -144,8 +144,7 @@ def _delayed(ns: Ints, options: SimOptions, name: str) -> Ints:
         (options, 'delay'), (options.real, 'jitter'), (options.real, 'clock_rate')))
     ns = ns + np.rint(rate * ns).astype(np.int64)
     if not jitter:
-        delayed: Ints = ns + round(delay * 1e9)
-        return delayed
+        return np.asarray(ns + round(delay * 1e9))
     rng = make_rng(options.seed, f'real {name} stamps')
     return real_sensors.delayed_stamps(ns, rng, delay, jitter)
 

@@ -110,8 +110,7 @@ def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
     if options.drive == OMNI:       # it rolls clockwise about the middle, seen from above
         radius = np.hypot(x, y)
         lateral = running_integral(state.t, state.sway[:, 0])
-        out: Floats = (y * state.travel - x * lateral) / radius - radius * state.turned
-        return out
+        return np.asarray((y * state.travel - x * lateral) / radius - radius * state.turned)
     side = -1.0 if y > 0 else 1.0       # left, right
     if options.drive == MECANUM:
         lateral = running_integral(state.t, state.sway[:, 0]) / SIDEWAYS
@@ -144,8 +143,7 @@ def slip_share(state: State, real: RealEffects) -> Floats:
              + AIR_DRAG * state.speed**2)
     # half of the load is on the driven axle; all wheels brake
     pull = 2 * np.maximum(force, 0.0) if real.driven else np.zeros_like(force)
-    share: Floats = real.tyre_slip * (pull + np.minimum(force, 0.0))
-    return share
+    return np.asarray(real.tyre_slip * (pull + np.minimum(force, 0.0)))
 
 
 def tyre_slip(state: State, real: RealEffects) -> Floats:

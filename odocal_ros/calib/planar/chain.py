@@ -81,9 +81,8 @@ class Solution:
                  prior_gradient: Floats) -> None:
         """Solve; weight : 1 / level of each of the equations; prior : information, (m, m)."""
         def weighted_sum(name: str) -> Floats:
-            total: Floats = sum(w * getattr(level, name)
-                                for w, level in zip(weight, equations, strict=True))
-            return total
+            return np.asarray(sum(w * getattr(level, name)
+                                  for w, level in zip(weight, equations, strict=True)))
         n, s = weighted_sum('gradient').shape
         self._band = cholesky_banded(_banded(
             weighted_sum('diagonal'), weighted_sum('off_diagonal')))
