@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The files of a bag, found from the path that a user names, and decompressed if needed.
-
-In: a folder, a metadata.yaml, or a file of a bag. Out: the files in the order of recording, each
-plain and with its format.
-"""
+"""The files of a bag, found from the path that a user names, and decompressed if needed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Write a bag of several topics in order of time, completely or not at all, by rosbags.
-
-In: topics with serialised messages. Out: a folder, which has its name only once it is complete.
-"""
+"""Write a bag of several topics in order of time, completely or not at all, by rosbags."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

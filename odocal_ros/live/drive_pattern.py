@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The node that drives a robot along a calibration pattern (``pattern.py``).
-
-In: poses of the robot, and a bumper. Out: velocity commands.
-"""
+"""The node that drives a robot along a calibration pattern (``pattern.py``)."""
 
 from functools import partial
 import math

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Health of one topic: rate, lost messages, gaps and jumps of time, for status and operator.
-
-In: stamps, sequence numbers and arrival times of the messages. Out: counts, and a mask of messages
-with a plausible stamp.
-"""
+"""Health of one topic: rate, lost messages, gaps and jumps of time, for status and operator."""
 
 from collections import deque
 from collections.abc import Sequence

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The calibration node: it builds its parts, connects them, and runs them by one timer.
-
-In: messages of the inputs, and services of the operator. Out: status, diagnostics and results.
-"""
+"""The calibration node: it builds its parts, connects them, and runs them by one timer."""
 
 from collections.abc import Callable
 from functools import partial

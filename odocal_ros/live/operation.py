@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Commands of the calibration node: services of the operator, and automatic legs (leg.automatic).
-
-In: a request. Out: its answer, success and text; each refusal states cause and action.
-"""
+"""Commands of the calibration node: services of the operator, and automatic legs."""
 
 from functools import partial
 from typing import Any

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-What the calibration node publishes: status, diagnostics, paths, and result parameters.
-
-In: a ``SessionView`` of the node. docs/interface.md describes the keys of the status.
-"""
+"""What the calibration node publishes: status, diagnostics, paths, and result parameters."""
 
 from functools import partial
 import math

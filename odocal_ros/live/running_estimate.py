@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Running estimate: values, sigmas and problems of the leg while it is driven.
-
-In: the samples so far, every few seconds. Out: a ``Forecast`` (estimates, their sigmas, and the
-distance that is still needed) for status and operator. The worker computes it.
-"""
+"""Running estimate: values, sigmas and problems of the leg while it is driven."""
 
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-One input topic of a node, from the search for its publishers to samples.
-
-In: raw messages. Out: samples, by the same readers as for bags, the health of the topic, and the
-reason why no usable message arrives.
-"""
+"""One input topic of a node, from the search for its publishers to samples."""
 
 from collections.abc import Callable, Sequence
 import difflib

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Worker thread of the calibration node: runs computations one at a time, outside the executor.
-
-In: functions. Out: their results, as callbacks that run in the thread of the executor.
-"""
+"""Worker thread of the calibration node: runs computations one at a time, outside the executor."""
 
 from collections.abc import Callable
 import ctypes

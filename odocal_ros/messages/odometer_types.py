@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Odometer messages: which field has the value, and whether it is a count, an angle or a speed.
-
-In: the message type, the settings and a first message. Out: a plan: the fields to read for each
-wheel, and their meaning.
-"""
+"""Odometer messages: which field has the value, and whether it is a count, an angle or a speed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Simulate a drive: a named route, its sensors, and the truth.
-
-In: SimOptions. Out: a ``Drive``, with the samples as a bag would give them.
-"""
+"""Simulate a drive: a named route, its sensors, and the truth."""
 
 from dataclasses import dataclass, replace
 from typing import Any
