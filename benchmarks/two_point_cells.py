@@ -46,14 +46,14 @@ class Cell:
     def __init__(self, scenario: str, grade: str, noise: str) -> None:
         from odocal_ros.sim import scenarios, sensors
         from odocal_ros.sim.motion import contact_travel
+        from odocal_ros.sim.noise import PHASE, stamps
         self.options = scenarios.resolved(scenarios.SimOptions(
             scenario=scenario, imu_grade=grade, fix_noise=noise, **RATES))
         clean = dataclasses.replace(self.options, imu_grade='perfect', fix_sigma=0.0)
         self.motion = scenarios.motion_of(self.options)
         self.imu, self.fix = sensors.imu(self.motion, clean), sensors.fixes(self.motion, clean)
         self.covariance = sensors.fixes(self.motion, self.options).covariance_n
-        ns, t = sensors.stamps(self.motion.duration, self.options.odometer_rate,
-                               sensors.PHASE['odometer'])
+        ns, t = stamps(self.motion.duration, self.options.odometer_rate, PHASE['odometer'])
         self.odometer_ns = self.options.start_ns + ns
         self.pulses = contact_travel(self.motion.at(t), (0.0, 0.0, 0.0)) / self.options.scale
         self.truth = scenarios._truth(self.motion, self.options, self.imu)

@@ -19,15 +19,10 @@ from odocal_ros.data.samples import LOCAL_STATUS, VelocitySamples
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening import clocks
+from odocal_ros.screening import clocks, glitches
 from odocal_ros.screening.axles import usable_axles
 from odocal_ros.screening.even_imu_times import even_imu_times
 from odocal_ros.screening.fix_screen import dead_reckoned_fixes, usable_fixes, velocity_reasons
-from odocal_ros.screening.glitches import (
-    frozen_gyro_reasons,
-    saturation_reasons,
-    without_invalid_orientations,
-)
 from odocal_ros.screening.imu_faults import alternating_imu_reasons, other_frame_reasons
 from odocal_ros.screening.inputs import Inputs, locate_fixes, UsableRows
 from odocal_ros.screening.leg_kind import with_assumed_force, without_north
@@ -74,8 +69,8 @@ def screen(leg: Leg, config: Config,
         reasons += topic_gap(slot, wheel.t)
     if check_faults:
         reasons += alternating_imu_reasons(imu.w_i, imu.f_i)
-        reasons += saturation_reasons(t_imu, imu.w_i, imu.f_i, config.imu)
-        reasons += frozen_gyro_reasons(t_imu, imu.w_i, wheels.mean, config.leg.max_gap)
+        reasons += glitches.saturation_reasons(t_imu, imu.w_i, imu.f_i, config.imu)
+        reasons += glitches.frozen_gyro_reasons(t_imu, imu.w_i, wheels.mean, config.leg.max_gap)
         # one axle is only tested with an accelerometer
         if len(wheels.wheels) > (1 if inputs.has_accelerometer else len(SIDES)):
             wheels, axle_reasons = usable_axles(
@@ -129,7 +124,7 @@ def _usable_topics(leg: Leg, config: Config, check_faults: bool,
     def usable(slot: str) -> tuple[UsableRows, list[Reason]]:
         samples, t, reasons = usable_rows(slot, leg, config, offset[slot])
         if check_faults and hasattr(samples, 'q_ni'):
-            samples = without_invalid_orientations(samples)
+            samples = glitches.without_invalid_orientations(samples)
         if slot == 'imu':
             t = even_imu_times(t, samples.w_i, samples.f_i)
         return UsableRows(samples, t), reasons

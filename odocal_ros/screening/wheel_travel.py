@@ -22,13 +22,9 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.odometer import make_travel, mean_travel, MIN_STEPS, Travel
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening import odometer_rows
 from odocal_ros.screening.inputs import UsableRows
 from odocal_ros.screening.late_rows import sampling_times
-from odocal_ros.screening.odometer_rows import (
-    counter_steps,
-    with_gap_uncertainty,
-    without_false_rows,
-)
 from odocal_ros.settings.config import Config
 
 # known spans of integer counts, and of angles in rad or deg
@@ -233,14 +229,14 @@ def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, c
     uncertain_t = uncertain_sigma = np.empty(0)
     reasons: list[Reason] = []
     if form.quantity == 'cumulative':
-        step = counter_steps(samples.value, form.modulus)
+        step = odometer_rows.counter_steps(samples.value, form.modulus)
         samples, rollover_reasons, uncertain_t, uncertain_sigma = correct_rollovers(
             t, samples, step, name, only_counter=not side)
         reasons += rollover_reasons
-    samples, t, false_reasons = without_false_rows(samples, t, form, odometer)
+    samples, t, false_reasons = odometer_rows.without_false_rows(samples, t, form, odometer)
     t, late_reasons = sampling_times(samples, t, form, odometer)
     travel, reset_reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
-    travel, gap_t, gap_sigma = with_gap_uncertainty(travel, samples.value, form)
+    travel, gap_t, gap_sigma = odometer_rows.with_gap_uncertainty(travel, samples.value, form)
     return (replace(travel, name=side),
             (np.append(uncertain_t, gap_t), np.append(uncertain_sigma, gap_sigma)),
             [*reasons, *false_reasons, *late_reasons, *reset_reasons])

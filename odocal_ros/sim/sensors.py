@@ -19,19 +19,8 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.nav import rotations
 from odocal_ros.nav.geodesy import radii
 from odocal_ros.settings.config import DIFFERENTIAL, HOLONOMIC
-from odocal_ros.sim import body, real_sensors, wheels
+from odocal_ros.sim import body, noise, real_sensors, wheels
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
-from odocal_ros.sim.noise import (
-    gauss_markov,
-    make_rng,
-    PHASE,
-    random_walk,
-    reference_drift,
-    stamps,
-    stationary_sigma,
-    TRANSPORT_DELAY,
-    white,
-)
 from odocal_ros.sim.options import REFERENCES, SIM_GRADES, SimOptions
 from odocal_ros.sim.real_effects import ZEROS3
 
@@ -51,7 +40,7 @@ def turn_on_biases(options: SimOptions) -> tuple[Floats, Floats]:
     """Return gyro and accelerometer bias at the first sample, frame i: (3,) each."""
     grade, real = SIM_GRADES[options.imu_grade], options.real
     gyro, accel = (
-        sigma * make_rng(options.seed, f'{name} bias').standard_normal(3) if value is None
+        sigma * noise.make_rng(options.seed, f'{name} bias').standard_normal(3) if value is None
         else np.array(value) for name, sigma, value in (
             ('gyro', grade.gyro_bias, real.gyro_bias),
             ('accelerometer', grade.accel_bias, real.accel_bias)))
@@ -64,15 +53,16 @@ def imu_errors(options: SimOptions, n: int) -> tuple[Floats, Floats]:
     gyro, accel = turn_on_biases(options)
 
     def error(name: str, bias: Floats, root_rate: float, root_psd: float) -> Floats:
-        walk = random_walk(make_rng(seed, f'{name} walk'), root_rate, rate, (n, 3))
-        return bias + walk + white(make_rng(seed, f'{name} white'), root_psd, rate, (n, 3))
+        walk = noise.random_walk(noise.make_rng(seed, f'{name} walk'), root_rate, rate, (n, 3))
+        rng = noise.make_rng(seed, f'{name} white')
+        return bias + walk + noise.white(rng, root_psd, rate, (n, 3))
     return (error('gyro', gyro, grade.gyro_bias_walk, grade.gyro_noise),
             error('accelerometer', accel, grade.accel_bias_walk, grade.accel_noise))
 
 
 def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
     """Return the IMU's samples over the whole drive."""
-    ns, t = stamps(motion.duration, options.imu_rate)
+    ns, t = noise.stamps(motion.duration, options.imu_rate)
     state = motion.at(t)
     C_vi = imu_rotation(options)
     w_v, f_v = body.imu_output(motion, state, options.imu_lever_arm)
@@ -88,21 +78,22 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
         variance = np.full(len(t), options.orientation_sigma**2)
     real = options.real
     if real.imu_latency or real.imu_jitter or real.imu_batch > 1:
-        ns = real_sensors.delayed_stamps(ns, make_rng(options.seed, 'real imu stamps'),
+        ns = real_sensors.delayed_stamps(ns, noise.make_rng(options.seed, 'real imu stamps'),
                                          real.imu_latency, real.imu_jitter, real.imu_batch)
     stamp = options.start_ns + ns
     return samples.ImuSamples(
-        stamp, stamp + round(TRANSPORT_DELAY['imu'] * 1e9), w_i + gyro + gyro_drift,
+        stamp, stamp + round(noise.TRANSPORT_DELAY['imu'] * 1e9), w_i + gyro + gyro_drift,
         f_i + accel + accel_drift, q_ni, variance)
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.HeadingSamples:
     """Return an external heading of b's x axis, as from a dual-antenna receiver."""
-    ns, t = stamps(motion.duration, options.heading_rate, PHASE['heading'])
+    ns, t = noise.stamps(motion.duration, options.heading_rate, noise.PHASE['heading'])
     q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=ZEROS3), sigma, 'heading')
     stamp = options.start_ns + ns
-    return samples.HeadingSamples(stamp, stamp + round(TRANSPORT_DELAY['heading'] * 1e9), q_nb,
-                                  np.full(len(t), sigma**2))
+    return samples.HeadingSamples(
+        stamp, stamp + round(noise.TRANSPORT_DELAY['heading'] * 1e9), q_nb,
+        np.full(len(t), sigma**2))
 
 
 def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
@@ -111,8 +102,8 @@ def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
     sigma = options.pressure_sigma
     if sigma is None:
         return samples.ScalarSamples.empty()
-    ns, t = stamps(motion.duration, rate, PHASE['pressure'])
-    state, draw = motion.at(t), make_rng(options.seed, 'pressure').standard_normal
+    ns, t = noise.stamps(motion.duration, rate, noise.PHASE['pressure'])
+    state, draw = motion.at(t), noise.make_rng(options.seed, 'pressure').standard_normal
     # change by weather, m/s; by wind, m per (m/s)^2; by temperature, relative
     weather, wind, temperature = draw(3) * [1e-3, 6e-3, 0.03]
     height = (state.height + wind * state.speed**2 + weather * t) / (1 + temperature)
@@ -124,13 +115,13 @@ def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
 def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> Floats:
     """Return q_ni with a constant heading error, like that of a compass."""
     q_ni = rotations.quat_from_matrix(attitude(state) @ imu_rotation(options))
-    error = sigma * make_rng(options.seed, name).standard_normal()
+    error = sigma * noise.make_rng(options.seed, name).standard_normal()
     return rotations.quat_multiply(rotations.quat_from_rotvec([0.0, 0.0, error]), q_ni)
 
 
 def odometers(motion: Motion, options: SimOptions) -> list[samples.OdometerSamples]:
     """Return the samples of each wheel; pulses are whole counts, rounded down."""
-    ns, t = stamps(motion.duration, options.odometer_rate, PHASE['odometer'])
+    ns, t = noise.stamps(motion.duration, options.odometer_rate, noise.PHASE['odometer'])
     state = motion.at(t)
     stamp = options.start_ns + _delayed(ns, options, 'odometer')
     lean = motion.lean(t) if motion.lean else 0.0
@@ -145,7 +136,7 @@ def _delayed(ns: Ints, options: SimOptions, name: str) -> Ints:
     ns = ns + np.rint(rate * ns).astype(np.int64)
     if not jitter:
         return np.asarray(ns + round(delay * 1e9))
-    rng = make_rng(options.seed, f'real {name} stamps')
+    rng = noise.make_rng(options.seed, f'real {name} stamps')
     return real_sensors.delayed_stamps(ns, rng, delay, jitter)
 
 
@@ -155,12 +146,13 @@ def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
     slip_path = slip(state, options, wheel.stream)
     radius_ratio = 1 + wheels.tyre_growth(state, real)      # to a cold, slow tyre
     if options.odometer == 'speed':
-        noise = options.speed_noise * make_rng(options.seed, 'speed').standard_normal(len(state.t))
+        rng = noise.make_rng(options.seed, 'speed')
+        error = options.speed_noise * rng.standard_normal(len(state.t))
         # current slip: differences of a speed sent twice a second would smooth it
         slip_speed = wheels.slip_share(state, real) * state.speed
         rate = (contact_speed(state, arm, lean) + slip_speed
                 + np.gradient(slip_path, state.t)) / radius_ratio
-        sent = wheels.low_passed(rate + noise, state.t, real.speed_filter)
+        sent = wheels.low_passed(rate + error, state.t, real.speed_filter)
         return wheels.quantized(sent / scale, real)
     path = (contact_travel(state, arm, lean) if options.drive == DIFFERENTIAL else
             wheels.robot_path(state, options, wheel))
@@ -171,7 +163,8 @@ def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
         mean_ratio = (radius_ratio + np.roll(radius_ratio, 1)) / 2      # of each step
         rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / mean_ratio)
     rolled = rolled / scale
-    phase = make_rng(options.seed, f'pulse phase {wheel.stream}').uniform()   # angle of the disc
+    # angle of the disc
+    phase = noise.make_rng(options.seed, f'pulse phase {wheel.stream}').uniform()
     if options.odometer == 'angle':
         return rolled + phase
     return FIRST_COUNT + np.floor(rolled + phase).astype(np.int64)
@@ -185,10 +178,10 @@ def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
         moving |= np.abs(state.sway[:, 0]) > MOTION_LIMIT
     steps = np.diff(state.t, prepend=state.t[:1]) * moving
     if options.slip_walk:
-        walk = make_rng(options.seed, f'slip walk {side}')
+        walk = noise.make_rng(options.seed, f'slip walk {side}')
         length += options.slip_walk * np.cumsum(np.sqrt(steps) * walk.standard_normal(len(length)))
     if options.slip_events:     # each takes a second
-        rng = make_rng(options.seed, f'slip events {side}')
+        rng = noise.make_rng(options.seed, f'slip events {side}')
         spins = rng.poisson(options.slip_events * steps.sum() / 3600)
         for begin in rng.choice(state.t[moving], spins):
             length += options.slip_size * np.clip(state.t - begin, 0.0, 1.0)
@@ -210,11 +203,11 @@ def _travel_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
 
 def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     """Return GNSS fixes of the antenna, without those in an outage."""
-    ns, t = stamps(motion.duration, options.fix_rate, PHASE['fix'])
+    ns, t = noise.stamps(motion.duration, options.fix_rate, noise.PHASE['fix'])
     real = options.real
     latitude, longitude, height = real_sensors.positions(motion, t, options)
     error = fix_errors(t, options) + real_sensors.position_errors(t, options)
-    error = error + reference_drift(t, motion.at(t).travel, options)
+    error = error + noise.reference_drift(t, motion.at(t).travel, options)
     error = real_sensors.fused_errors(t, error, options)
     meridian, normal = radii(latitude)
     metres_per_rad = np.stack([(normal + height) * np.cos(latitude), meridian + height], -1)
@@ -227,7 +220,7 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     variance_ratio = 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
     slow_variance = sum(sigma**2 for sigma, _ in real.slow_errors)
     # of east, north and up, without bursts
-    variance = (_axis_sigmas(options) ** 2 * variance_ratio + stationary_sigma(options)**2
+    variance = (_axis_sigmas(options) ** 2 * variance_ratio + noise.stationary_sigma(options)**2
                 + slow_variance * np.array([1.0, 1.0, real_sensors.UP_RATIO**2]))
     variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
     if REFERENCES[options.reference].is_planar:
@@ -235,14 +228,14 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     n = len(t)
     stamp = options.start_ns + _delayed(ns, options, 'fix')
     sent = samples.FixSamples(
-        stamp, stamp + round(TRANSPORT_DELAY['fix'] * 1e9), latitude, longitude,
+        stamp, stamp + round(noise.TRANSPORT_DELAY['fix'] * 1e9), latitude, longitude,
         height + error[:, 2], np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
         np.full(n, 2 if options.fix_noise == 'rtk' else 0))
     received = np.ones(n, dtype=bool)
     for begin, end in options.outages:
         received &= (t < begin) | (t >= end)
     if real.drops:
-        received &= make_rng(options.seed, 'real drops').uniform(size=n) >= real.drops
+        received &= noise.make_rng(options.seed, 'real drops').uniform(size=n) >= real.drops
     return samples.take(sent, received)
 
 
@@ -252,13 +245,13 @@ def _axis_sigmas(options: SimOptions) -> Floats:
 
 def fix_errors(t: Floats, options: SimOptions) -> Floats:
     """Return the errors of fixes at (n,) times, ENU, m: (n, 3), outliers included."""
-    draws = make_rng(options.seed, 'fix white').standard_normal((len(t), 3))
+    draws = noise.make_rng(options.seed, 'fix white').standard_normal((len(t), 3))
     if options.fix_noise == 'correlated':
-        slow = gauss_markov(make_rng(options.seed, 'fix slow'), 1.0,
+        slow = noise.gauss_markov(noise.make_rng(options.seed, 'fix slow'), 1.0,
                             options.fix_correlation_time, t)
         draws = slow + WHITE_SHARE * draws
     errors = _axis_sigmas(options) * draws
-    rng = make_rng(options.seed, 'outliers')
+    rng = noise.make_rng(options.seed, 'outliers')
     share, bearing = rng.uniform(size=len(t)), rng.uniform(0, 2 * np.pi, len(t))
     distance = options.outlier_size * rng.uniform(0.5, 1.5, len(t)) * (share < options.outliers)
     errors[:, 0] += distance * np.cos(bearing)

@@ -19,8 +19,8 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.inputs import locate_fixes
 from odocal_ros.screening.screen import screen
-from odocal_ros.sim import body, motion, sensors
-from odocal_ros.sim.noise import make_rng, random_walk
+from odocal_ros.sim import body, motion
+from odocal_ros.sim.noise import make_rng, PHASE, random_walk, stamps
 from odocal_ros.sim.options import SIM_GRADES
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -59,7 +59,7 @@ def leg_of(leg, config):
 def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
     """Return the leg with a GNSS velocity at 5 Hz; errors converts (n, 3) draws to m/s."""
     o = drive.options
-    ns, t = sensors.stamps(drive.motion.duration, 5.0, sensors.PHASE['fix'])
+    ns, t = stamps(drive.motion.duration, 5.0, PHASE['fix'])
     state = drive.motion.at(t)
     swing = np.cross(np.stack([0 * t, 0 * t, state.yaw_rate], -1), o.antenna_lever_arm)
     v = motion.velocity_n(state) + np.einsum('kij,kj->ki', motion.attitude(state), swing)
@@ -97,7 +97,7 @@ def truth(drive, config, leg) -> layout.State:
 
 def _biases(drive, since):
     o, grade = drive.options, SIM_GRADES[drive.options.imu_grade]
-    n = len(sensors.stamps(drive.motion.duration, o.imu_rate)[0])
+    n = len(stamps(drive.motion.duration, o.imu_rate)[0])
     k = np.clip(np.round(since * o.imu_rate).astype(int), 0, n - 1)
     return ((first + random_walk(make_rng(o.seed, name), walk, o.imu_rate, (n, 3)))[k]
             for first, name, walk in (

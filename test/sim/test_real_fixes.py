@@ -11,6 +11,7 @@ import pytest
 
 from odocal_ros.sim import motion, real_sensors, sensors
 from odocal_ros.sim.motion import point
+from odocal_ros.sim.noise import PHASE, stamps
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
@@ -135,7 +136,7 @@ def true(drive, t):
 
 
 def times(drive):
-    return sensors.stamps(drive.motion.duration, 10.0, sensors.PHASE['fix'])[1]
+    return stamps(drive.motion.duration, 10.0, PHASE['fix'])[1]
 
 
 def test_velocity_is_that_of_the_antenna():

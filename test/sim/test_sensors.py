@@ -13,7 +13,7 @@ from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_quat, matrix_
 from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, inertial_v, Motion, Start
-from odocal_ros.sim.noise import gauss_markov, make_rng, random_walk, white
+from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, random_walk, stamps, white
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.profile import chain, hold, ramp
 from odocal_ros.sim.scenarios import motion_of, simulate
@@ -180,7 +180,7 @@ def test_late_stamps_change_no_value():
 def test_slip_occurs_only_in_motion_with_the_configured_size():
     options = resolved(replace(TOWN, slip_walk=0.01, odometer_rate=200.0))
     drive = motion(seconds=200.0)
-    _, t = sensors.stamps(drive.duration, 200.0)
+    _, t = stamps(drive.duration, 200.0)
     state = drive.at(t)
     steps = np.diff(sensors.slip(state, options))
     moving = state.speed[1:] > sensors.MOTION_LIMIT
@@ -198,7 +198,7 @@ def test_slip_occurs_only_in_motion_with_the_configured_size():
 def test_a_wheel_slips_after_each_start_and_not_elsewhere():
     options = resolved(replace(TOWN, start_slip=0.005, start_slip_time=5.0))
     drive = motion_of(options)
-    _, t = sensors.stamps(drive.duration, 50.0, sensors.PHASE['odometer'])
+    _, t = stamps(drive.duration, 50.0, PHASE['odometer'])
     state = drive.at(t)
     spun = sensors.slip(state, options)
     moving = state.speed > sensors.MOTION_LIMIT
