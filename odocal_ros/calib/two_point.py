@@ -24,7 +24,13 @@ from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_valu
 from odocal_ros.calib.slip import slip_source
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
+from odocal_ros.nav.dead_reckoning import (
+    axes_from_forward,
+    forward_b,
+    mounting_from_forward,
+    Origin,
+    Track,
+)
 from odocal_ros.nav.geodesy import geodesic_chord, plane_chord, plane_for
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
@@ -47,7 +53,7 @@ class Chord:
     origin: Origin
     start: MarkFix
     end: MarkFix
-    lever_b: Floats     # (3,) antenna from the odometer's point, m, in v
+    lever_v: Floats     # (3,) antenna from the odometer's point, m
     velocity_change: Floats  # (3, 3) end minus start; times f: m/s in n
     alignment: Alignment
     # travel lost in gaps and resets: times, s, and sigmas, scale units
@@ -78,8 +84,7 @@ def solve(chord: Chord, up_scale: float = 1.0, limit: float = PITCH_LIMIT) -> tu
                           and up_scale * sigma < PITCH_PRIOR * np.hypot(*antenna[:2]))
     f = np.array([1.0, 0.0, 0.0])
     for _ in range(4):      # the lever arm turns with the mounting angles: converges at once
-        yaw, pitch = map(float, mounting_from_forward(f / np.linalg.norm(f)))
-        c = antenna - turn @ _C_bv(yaw, pitch) @ chord.lever_b
+        c = antenna - turn @ axes_from_forward(f) @ chord.lever_v
         if vertical_known:
             f = np.linalg.solve(M, c)
             if abs(np.arctan2(f[2], np.hypot(f[0], f[1]))) > limit:
@@ -87,13 +92,6 @@ def solve(chord: Chord, up_scale: float = 1.0, limit: float = PITCH_LIMIT) -> tu
         else:
             f = np.append(np.linalg.solve(M[:2, :2], c[:2]), 0.0)
     return f, vertical_known
-
-
-def _C_bv(yaw: float, pitch: float) -> Floats:
-    """Return the rotation that takes v to b for mounting angles, roll 0."""
-    x = forward_b(yaw, pitch)
-    y = np.array([np.cos(pitch) * np.sin(yaw), np.cos(yaw), np.sin(pitch) * np.sin(yaw)])
-    return np.stack([x, y, np.cross(x, y)], -1)
 
 
 def refusal_reasons(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
@@ -255,10 +253,10 @@ def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
     # the track has nominal_scale, yaw 0 and the estimated pitch, and begins at the start mark.
     # As in the paper, o is the start, b the end by the fixes, b_dr the end of the track
     K = np.linalg.norm(f)
-    yaw, pitch = map(float, mounting_from_forward(f / K))
+    _, pitch = map(float, mounting_from_forward(f / K))
     turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)
     start_n = chord.start.position_n
-    end_n = chord.end.position_n - turn @ _C_bv(yaw, pitch) @ chord.lever_b
+    end_n = chord.end.position_n - turn @ axes_from_forward(f) @ chord.lever_v
     reckoned_n = start_n + nominal_scale * chord.M @ forward_b(0.0, pitch)
     o, b, b_dr = (chord.origin.to_geodetic(p) for p in (start_n, end_n, reckoned_n))
     plane = plane_for(config.projection, o[1] + wrap(b[1] - o[1]) / 2)

@@ -122,6 +122,14 @@ def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
     return np.arctan2(-y, sign * np.hypot(x, z)), np.arctan2(sign * z, sign * x)
 
 
+def axes_from_forward(f: ArrayLike) -> Floats:
+    """Return C_bv, (3, 3), for a forward axis in b of any length, (3,), and a roll of 0."""
+    yaw, pitch = mounting_from_forward(np.asarray(f) / np.linalg.norm(f))
+    forward = forward_b(yaw, pitch)
+    left = np.array([np.cos(pitch) * np.sin(yaw), np.cos(yaw), np.sin(pitch) * np.sin(yaw)])
+    return np.stack([forward, left, np.cross(forward, left)], -1)
+
+
 def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
                 min_chord: float = geodesy.MIN_GNSS_MOTION) -> float | None:
     """

@@ -86,7 +86,7 @@ class PreparedLeg(LocatedFixes):
     inputs: Inputs                       # screened
     config: Config
     imu_orientation: ImuOrientation | None    # None: not determined
-    lever_b: NDArray[np.float64]         # (3,) m, from the odometer's point to the antenna
+    lever_v: NDArray[np.float64]         # (3,) m, from the odometer's point to the antenna
     spans: NDArray[np.float64]           # (s, 2) s, standstills
     alignment: Alignment
     alignment_reasons: tuple[Reason, ...]
@@ -103,10 +103,11 @@ class PreparedLeg(LocatedFixes):
     def path(self, f: Floats, track: dead_reckoning.Track | None = None) -> Path:
         """Return the path of the antenna for f, (3,) scale times forward axis in b."""
         track = self.track if track is None else track
+        lever_b = dead_reckoning.axes_from_forward(f) @ self.lever_v
 
         def at(t: Floats) -> Floats:
             path = track.at(t) @ f
-            return path + track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
+            return path + track.C_nb_at(t) @ lever_b if np.any(lever_b) else path
         return at
 
     def level_path(self, t: Floats) -> Floats:

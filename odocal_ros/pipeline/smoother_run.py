@@ -54,7 +54,8 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     travel = prepared.inputs.travel
     t, q_nb = _attitude(prepared, method.details)
     track = dead_reckon(t, q_nb, replace(travel, t=travel.t - delays_s['odometer']))
-    lever_b, f = _lever(method.estimates, prepared.config), method.details['f']
+    lever_b = method.details['C_bv'] @ _lever_v(method.estimates, prepared.config)
+    f = method.details['f']
     as_sent = method.estimates.get('scale_factor_as_sent')
     if as_sent is not None:        # the travel here is that of uncorrected speeds
         f = f * (as_sent.value or 0.0) / np.linalg.norm(f)
@@ -110,8 +111,8 @@ def _delayed_path(track: Track, f: Floats, lever_b: Floats, delay: float) -> Pat
     return path
 
 
-def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
-    """Return odometer point to antenna, as estimated, otherwise as configured: (3,) m, in b."""
+def _lever_v(estimates: Mapping[str, Estimate], config: Config) -> Floats:
+    """Return odometer point to antenna, as estimated, otherwise as configured: (3,) m."""
     antenna, odometer = (
         np.array([value if (e := estimates[f'{name}_lever_arm_{axis}']).value is None else e.value
                   for axis, value in zip('xyz', section.lever_arm, strict=True)])
@@ -137,4 +138,4 @@ def planar_input(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
     return planar_leg(dead_reckon(*prepared.epochs, left), dead_reckon(*prepared.epochs, right),
                       inputs.t_fix[between], prepared.fixes_n[between],
                       inputs.covariance_n[between], (start.t, start.position_n),
-                      (scale, scale), pitch, prepared.lever_b)
+                      (scale, scale), pitch, prepared.lever_v)

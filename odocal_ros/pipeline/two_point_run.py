@@ -102,7 +102,7 @@ class TwoPointRun:
                          for name, mark in (('start', start), ('end', end)) if mark is None]
         if start is None or end is None:
             return None
-        chord = Chord(track, prepared.origin, start, end, prepared.lever_b,
+        chord = Chord(track, prepared.origin, start, end, prepared.lever_v,
                       self._velocity_change((start, end)), prepared.alignment,
                       (self.inputs.uncertain_t, self.inputs.uncertain_sigma))
         exact = all(m.standing or m.surveyed for m in (start, end))

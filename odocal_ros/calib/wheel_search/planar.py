@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.nav.dead_reckoning import forward_b, Track
+from odocal_ros.nav.dead_reckoning import axes_from_forward, forward_b, Track
 from odocal_ros.nav.rotations import arctan2, wrap
 
 CHUNK = 500_000          # judgement: distances in memory at once: 4 MB, which stays in the cache
@@ -75,7 +75,7 @@ class PlanarLeg:
 
 def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Floats,
                covariance_n: Floats, start: tuple[float, Floats], scales: tuple[float, float],
-               pitch: float = 0.0, lever_b: ArrayLike = (0.0, 0.0, 0.0)) -> PlanarLeg:
+               pitch: float = 0.0, lever_v: ArrayLike = (0.0, 0.0, 0.0)) -> PlanarLeg:
     """
     Project a leg of two wheels on the plane.
 
@@ -83,7 +83,7 @@ def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Fl
     t_fix, fixes_n, covariance_n : (k,), (k, 2 or 3), (k, 3, 3) fixes, s, m, m^2; those outside
     the tracks are left out.   start : (t, position_n) time, s, and antenna position, m, at the
     begin of the tracks.   scales : (left, right) start values, m per unit.   pitch : pitch
-    mounting angle, rad: the forward axis is that of yaw 0.   lever_b : (3,) antenna from the
+    mounting angle, rad: the axes are those of yaw 0.   lever_v : (3,) antenna from the
     odometer's point, m.
     """
     t_start, start_n = start
@@ -97,7 +97,7 @@ def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Fl
     sigma = np.sqrt((covariance_n[use, 0, 0] + covariance_n[use, 1, 1]) / 2)
     return PlanarLeg(t, left, right, fixes, np.array(start_n[:2], dtype=float), sigma,
                      float(scales[0]), float(scales[1]),
-                     lever_n=(turn @ np.asarray(lever_b))[:, :2],
+                     lever_n=(turn @ axes_from_forward(forward) @ np.asarray(lever_v))[:, :2],
                      pieces=course_pieces(fixes, sigma))
 
 

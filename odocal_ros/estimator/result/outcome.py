@@ -212,7 +212,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
     return {
         'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
         'correlation': correlations(fit.covariance[:3, :3], PARAMETERS),
-        'f': K * state.forward,
+        'f': K * state.forward, 'C_bv': state.C_bv,
         'noise': fit.levels.sigmas(),
         'iterations': fit.iterations, 'widened': float(factor),
         'external': _external_details(problem, fit, sigma),
