@@ -33,9 +33,10 @@ class Code(Enum):
     NO_IMU = REJECT, ('Check the IMU topic and its QoS, or name the topic with --imu-topic. A '
                       'robot without an IMU: set odometer.left and odometer.right, or '
                       'odometer.wheels.')
-    NO_ACCELEROMETER = CAUTION, ('Yaw and pitch need an IMU that publishes specific force and '
-                                 'three turn rates (REP-145). Drive on level ground: unmodelled '
-                                 'slopes bias the scale.')
+    NO_ACCELEROMETER = CAUTION, ('For yaw and pitch use an IMU that publishes specific force and '
+                                 'three turn rates (REP-145); for the yaw, an external heading is '
+                                 'sufficient. Drive on level ground: unmodelled slopes bias the '
+                                 'scale.')
     NO_ODOMETER = REJECT, 'Check the odometer topic and odometer.type, or use --odometer-topic.'
     NO_FIX = REJECT, ('Drive under open sky and wait for a position before the start mark. '
                       'Without GNSS: start the localisation first, and name its topic with '
@@ -244,7 +245,8 @@ class Code(Enum):
     LEGS_UNLIKE = REJECT, ('Combine only legs of one vehicle, one mounting, and the same topics '
                            'and settings. Calibrate the other legs separately.')
     LEGS_OVERLAP = CAUTION, 'Give each recording once, and legs that do not overlap in time.'
-    LEG_REJECTED = CAUTION, 'See the reasons of this leg. Drive it again or leave it out.'
+    LEG_REJECTED = CAUTION, ('See the reasons of this leg. Drive it again, or exclude it: --leg, '
+                             'or live ~/undo_leg.')
     MORE_LEGS_NEEDED = CAUTION, 'Drive more legs. The required number is verdict.min_legs.'
     NO_METHOD = REJECT, 'See the reasons of the legs.'
 

@@ -204,7 +204,7 @@ def kind_of(path: Path) -> str:
             return kind
     content = 'a text file' if head and all(9 <= byte < 127 for byte in head) else (
         f'a file that starts with the bytes {head[:4].hex(" ")}' if head else 'an empty file')
-    raise BadBag(f'{path.name}: {content}, which is not a bag; give a folder of rosbag2, or a '
+    raise BadBag(f'{path.name}: {content}, which is not a bag; give a rosbag2 folder, or a '
                  '.mcap, .db3 or .bag file')
 
 

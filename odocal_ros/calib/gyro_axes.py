@@ -119,13 +119,13 @@ def _inverted_turns(orientation: ImuOrientation, wrong_axes: list[WrongAxis],
                     names: list[str]) -> tuple[Reason, ...]:
     """Return the reason for accelerations to the outside of turns."""
     text = ('accelerations in turns are opposite to turn rate and speed (ratio '
-            f'{orientation.centripetal:.2f} ± {orientation.centripetal_sigma:.1g} instead of 1)')
+            f'{orientation.centripetal:.2f} ± {orientation.centripetal_sigma:.1g}, expected: 1)')
     level = [name[-1] for name in names[:2]]
     # a mirrored level axis of the accelerometer makes the other level axis of the gyro look wrong
     wrong = [axis for axis in level
              if len(wrong_axes) == 1 and wrong_axes[0][:2] != (axis, '-' + axis)]
     if len(wrong) == 1:
-        return (Reason(Code.IMU_AXES, f'{text}, and gravity rotates about '
+        return (Reason(Code.IMU_AXES, f'{text}. Gravity rotates about '
                        f'{wrong_axes[0].published} opposite to the gyro: '
                        f'linear_acceleration.{wrong[0]} has the wrong sign',
                        f'Correct the IMU driver: negate linear_acceleration.{wrong[0]}. '
@@ -242,7 +242,7 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
         return ()
     if ratio < -ONE_MOTION_RATIO[0]:
         return (Reason(Code.GYRO_SIGN, 'turns by the gyro are opposite to those by the fixes '
-                       f'(ratio {ratio:.2f} instead of 1)'),)
+                       f'(ratio {ratio:.2f}, expected: 1)'),)
     degrees = 40.0 < ratio < 80.0       # 180 / pi, with a margin for scale errors and skid
     if abs(ratio) < 0.01:       # no error of the unit: revolutions give 0.16
         return (Reason(Code.IMU_UNITS, f'turns by the gyro are only {ratio:#.2g} times those by '

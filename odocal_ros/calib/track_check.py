@@ -122,8 +122,8 @@ def bend_reasons(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float,
     return (Reason(Code.MODEL_MISMATCH, f'the track deviates up to {deviation:.1f} m from the '
                    f'fixes; the limit is {allowed:.1f} m. Likely cause: gyro errors larger than '
                    'its grade, or invalid gyro values', 'Use method smoother, which also '
-                   'estimates the gyro errors. Check for lost or invalid IMU messages, or copy '
-                   'the recording again.'),)
+                   'estimates the gyro errors. If IMU messages are lost or invalid, copy the '
+                   'recording again.'),)
 
 
 def find_inliers(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:

@@ -64,7 +64,8 @@ def _pattern(text: str) -> re.Pattern[str]:
     try:
         pattern = re.compile(text)
     except re.error as error:
-        raise BadUsage(f'--vehicle-from {text}: {error}; required: a pattern with a group, such '
+        raise BadUsage(f'--vehicle-from {text}: {error}; required: a regular expression with a '
+                       'group, such '
                        "as 'fleet/(?P<vehicle>[^/]+)/'") from None
     if not pattern.groups:
         raise BadUsage(f"--vehicle-from {text}: it has no group; mark the vehicle's name, such "

@@ -61,14 +61,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f'(default {TIMEOUT:g})')
     add('--task-memory', type=_byte_count, default=2 * GIB, metavar='SIZE', help='memory limit '
         'per bag (default 2G)')
-    add('--tries', type=_positive_count, default=3, metavar='N', help='attempts for a '
-        'bag whose local worker process is killed (default 3)')
+    add('--tries', type=_positive_count, default=3, metavar='N', help='attempts per bag '
+        'if its local worker process is killed, such as out of memory (default 3)')
     add('--again', action='store_true', help='retry bags that failed')
     add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles that '
         'get a report of their own')
     add('--kpi', action='store_true', help='with limits (--accept): compare the decision on each '
         'leg with the decision on all legs of the vehicle; writes kpi.json')
-    add('--files', action='store_true', help='write ready-to-load files for each vehicle')
+    add('--files', action='store_true', help='write configuration files for each vehicle '
+        '(Autoware, ros2_control, receivers, TF)')
     add('--quiet', action='store_true', help='print nothing but errors, and the lines of --accept')
     add_calibration_arguments(parser)
 
@@ -91,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     jobs = bag_jobs(bags, args, output, args.task_timeout, args.task_memory)
     limits = with_settings(Config(), run_settings(jobs)).accept.limits
     if args.kpi and not limits:
-        raise BadUsage('--kpi needs limits: give --accept NAME=LOW:HIGH')
+        raise BadUsage('--kpi requires limits: give --accept NAME=LOW:HIGH')
     make_output_folder(output)
     with engine(args.scheduler, args.workers, args.task_memory, args.tries) as client:
         if not args.quiet:

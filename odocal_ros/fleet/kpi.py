@@ -125,9 +125,9 @@ def write_kpi(vehicles: Sequence[dict[str, Any]], limits: Limits, output: Path) 
 def _table_text(rates: dict[str, Any], output: Path) -> str:
     """Return the rates as lines of text: one for each duration of legs, and one for all."""
     counts = rates['vehicles']
-    lines = ['', f'legs tested against the limits: {counts["good"]} good vehicles, '
-             f'{counts["bad"]} bad, {counts["on_the_limit"]} left out (undecided, or fewer than '
-             f'{MIN_LEGS} legs)',
+    lines = ['', f'decisions on single legs of {counts["good"]} good and {counts["bad"]} bad '
+             f'vehicles; excluded: {counts["on_the_limit"]} (undecided, or fewer than {MIN_LEGS} '
+             'legs)',
              table_row(('minutes', 'legs', *(name.replace('_', ' ') for name in SHARES)),
                        KPI_WIDTHS)]
     for row in [*rates['by_minutes'], {'up_to': 'all'} | rates['all']]:

@@ -64,8 +64,8 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     mapping = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(mapping)
     if marked and 'fix' in mapping:
-        raise BadUsage(f'--fix-topic {mapping["fix"]}: marks (reference.marks) replace fixes; '
-                       'omit one of them')
+        raise BadUsage(f'--fix-topic {mapping["fix"]}: reference.marks is set, so fixes '
+                       'are not used; omit --fix-topic or reference.marks')
     errors: list[str] = []
     for slot in required_slots(config, marked):
         if slot in mapping:

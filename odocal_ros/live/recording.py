@@ -49,8 +49,8 @@ class Inputs:
         fix = self.by_slot['fix'].topic if 'fix' in self.by_slot else None
         for slot in ('odometer', 'odometer_right'):
             if slot in self.by_slot and self.by_slot[slot].topic == fix:
-                raise BadUsage(f'{fix} is both {slot} and fix: an odometer cannot be calibrated '
-                               'against itself; remap one of them to another topic')
+                raise BadUsage(f'topic {fix} is used as {slot} and as fix: an odometer cannot '
+                               'be calibrated against itself; remap one of them to another topic')
 
     def update(self, config: Config) -> None:
         """Add the topics that the configuration uses, and search for publishers."""

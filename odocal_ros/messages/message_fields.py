@@ -263,6 +263,6 @@ def sensor_plan(slot: str, msgtype: str, config: Config) -> SensorPlan:
     if slot == 'fix' and msgtype in LOCAL_TYPES:
         return SensorPlan(slot, LOCAL_TYPES[msgtype], local_fixes(config.reference.latitude_deg))
     if (slot, msgtype) not in SENSORS:
-        raise BadData(f'{slot}: messages of type {msgtype} cannot be used; give a topic of type '
+        raise BadData(f'{slot}: type {msgtype} is not supported; supported: '
                       f'{" or ".join(types_of(slot, config.odometer))}')
     return SensorPlan(slot, *SENSORS[slot, msgtype])

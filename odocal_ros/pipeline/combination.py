@@ -29,6 +29,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, TYRE_SPREAD
 from odocal_ros.settings.nominal import nominal_scale
 
+MOUNTING_PLAY = 0.087    # rad, 5 deg, judgement: mountings of one vehicle bend less
 # reasons of a single leg that do not hold for several
 SINGLE_LEG_CODES = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE,
                     Code.SCALE_FAR_FROM_NOMINAL}
@@ -242,16 +243,16 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
     if extremes and (excess := extremes[1].value / extremes[0].value - 1) > TYRE_SPREAD:
         low, high = extremes
         differences.append(f'the scale of leg {high.leg} is {100 * excess:.1f} % above '
-                           f'that of leg {low.leg}')
+                           f'that of leg {low.leg} (limit {100 * TYRE_SPREAD:.0f} %)')
     yaws = _values_by_leg('yaw_mounting_angle', estimates)
     # of a reversed IMU they are near +-180 deg
     extremes = _significant_extremes([yaw._replace(value=float(wrap(yaw.value - yaws[0].value)))
                                       for yaw in yaws])
-    # rad, 5 deg: mountings bend less
-    if extremes and (excess := extremes[1].value - extremes[0].value) > 0.087:
+    if extremes and (excess := extremes[1].value - extremes[0].value) > MOUNTING_PLAY:
         low, high = extremes
         differences.append(f'the yaw mounting of leg {high.leg} is {math.degrees(excess):.1f} deg '
-                           f'above that of leg {low.leg}')
+                           f'above that of leg {low.leg} (limit '
+                           f'{math.degrees(MOUNTING_PLAY):.0f} deg)')
     return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(differences)}: larger than changes of one '
                    'vehicle with one mounting'),) if differences else ()
 

@@ -158,8 +158,9 @@ def orientation_reasons(orientation: ImuOrientation | None,
     yaw_deg, sigma_deg = np.rad2deg([orientation.yaw, orientation.sigma])
     yaw_text = f'{yaw_deg:+z.0f} deg, ± {max(sigma_deg, 1):.0f}'
     if nominal:
-        yaw_text += f', nominal {np.rad2deg(nominal):+z.0f}'
-    observed = f'accelerations point {direction} in the IMU frame (yaw mounting {yaw_text})'
+        yaw_text += f', nominal {np.rad2deg(nominal):+z.0f} deg'
+    observed = (f'forward accelerations of the vehicle point {direction} in the IMU frame (yaw '
+                f'mounting {yaw_text}). Likely cause')
     reversed_limit = np.deg2rad(150.0)    # a reversed odometer looks the same
     if difference > reversed_limit:
         return (Reason(Code.ODOMETER_REVERSED, f'{observed}: positive counts mean reverse motion, '

@@ -69,8 +69,7 @@ def with_assumed_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...
     gravity_i = np.tile(up_i * G / (scale if scale > 1e-12 else 1.0), (len(leg.imu.f_i), 1))
     return replace(leg, imu=replace(leg.imu, f_i=gravity_i)), (Reason(
         Code.NO_ACCELEROMETER, f'the IMU {cause}. The scale is estimated from gyro, odometer and '
-        'fixes; the ground is assumed to be level. Yaw and pitch mounting need an '
-        'accelerometer; for the yaw an external heading is also sufficient'),)
+        'fixes; the ground is assumed to be level'),)
 
 
 def settings_by_frame(fix: samples.FixSamples, config: Config) -> Config:

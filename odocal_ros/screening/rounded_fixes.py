@@ -55,8 +55,8 @@ def rounding_variance(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, t
     return variance, (Reason(
         Code.FIXES_NOISIER_THAN_SAID, f'positions are rounded to {east:.2g} m east and '
         f'{north:.2g} m north: fix errors are {factor:.1f} times as large as their covariance '
-        f'states (limit {FIX_NOISE_LIMIT:g}); accounted for', 'Publish latitude and longitude as '
-        'double, with 8 decimals of a degree (NMEA: 6 decimals of a minute).'),)
+        f'states (limit {FIX_NOISE_LIMIT:g}); accounted for', 'Publish latitude and longitude '
+        'as double, unrounded or with at least 8 decimals of a degree (NMEA: 6 of a minute).'),)
 
 
 def common_step(angle: Floats) -> float:

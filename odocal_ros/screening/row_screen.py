@@ -94,7 +94,7 @@ def usable_rows(slot: str, leg: Leg, config: Config,
         zero = int((sent.stamp_ns <= 0).sum())
         reasons.append(Reason(
             NO_ROW_CODES[slot], f'none of the {len(sent.stamp_ns)} {label} messages is usable'
-            + (f': {zero} have no stamp (0)' if zero else ': values are missing or impossible'),
+            + (f': {zero} have no stamp (0)' if zero else ': values are missing or out of range'),
             _unstamped_remedy(slot) if zero else 'Check the driver that sends these messages, and '
             'wait for valid values before the drive.'))
     return rows, t, reasons

@@ -230,8 +230,8 @@ class WheelsConfig:
                                   "around each wheel's nominal factor, relative: twice the "
                                   'stated error; 0: 0.05.')
     heading_range: float = setting(0.0, 'rad', 0.0, 3.2, about='Half width of the search range '
-                                   'around the heading at the start; 0: twice its sigma, or 10 '
-                                   'deg if unknown.')
+                                   'of the initial heading; 0: twice its sigma, or 0.17 rad if '
+                                   'that is unknown.')
     levels: int = setting(7, '', 1, 49, about='Levels of each parameter in the first search, 3 '
                           'or more: rounded up to an odd prime power (with zero as a level) for '
                           'the orthogonal array.')

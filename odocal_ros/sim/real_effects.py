@@ -138,7 +138,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
     numbers = _numbers(name, value, default)
     if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
-        raise BadUsage(f'--real {name}: required: finite numbers')
+        raise BadUsage(f'--real {name}={value}: required: finite numbers')
     smallest = min(numbers, default=1.0)
     is_valid, requirement = smallest >= 0 or name in SIGNED, '0 or more'
     if name == 'drops':
@@ -165,7 +165,8 @@ def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
         return tuple(x for pair in value for x in pair)
     count = 3 if default is None else len(default) if isinstance(default, tuple) else 0
     if isinstance(value, tuple) != bool(count) or count and len(value) != count:
-        raise BadUsage(f'--real {name}: required: {f"{count} numbers" if count else "one number"}')
+        example = f'{count} numbers, such as ({"0," * (count - 1)}0.01)'
+        raise BadUsage(f'--real {name}: required: {example if count else "one number"}')
     return value if count else (value,)
 
 

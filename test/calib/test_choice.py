@@ -183,8 +183,9 @@ def test_legs_of_one_vehicle_are_consistent():
 
 @pytest.mark.parametrize(('legs', 'text'), [
     (({'scale': 0.0203}, {}, {'scale': 0.022}),
-     'the scale of leg 3 is 10.0 % above that of leg 2: larger than'),
-    (({}, {'yaw': 0.01 - 6 * DEG}), 'the yaw mounting of leg 1 is 6.0 deg above that of leg 2'),
+     'the scale of leg 3 is 10.0 % above that of leg 2 (limit 5 %): larger than'),
+    (({}, {'yaw': 0.01 - 6 * DEG}),
+     'the yaw mounting of leg 1 is 6.0 deg above that of leg 2 (limit 5 deg)'),
     (({}, {'scale': 0.03, 'yaw': 0.5}), ' and the yaw mounting of leg 2 is '),
     (({}, {'scale': 1.02, 'sigma': 1e-4, 'unit': '1'}, {}),
      'so their scales cannot be combined: m/pulse in leg 1, 3; 1 in leg 2'),

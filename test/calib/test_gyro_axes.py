@@ -116,13 +116,13 @@ def test_two_gyro_axes_with_the_same_signal_are_not_an_axis_fault(monkeypatch, x
     ('imu', {'f_i': lambda f: f * [-1.0, 1.0, 1.0], 'w_i': lambda w: w * [1.0, -1.0, -1.0]},
      'longitude (x and y) are swapped, or linear_acceleration is negated'),
     ('fix', {'longitude': np.negative}, 'longitude (x and y) are swapped, or linear_acceler'),
-    ('imu', {'w_i': np.negative, 'f_i': lambda f: np.full_like(f, np.nan)}, 'instead of 1)')])
+    ('imu', {'w_i': np.negative, 'f_i': lambda f: np.full_like(f, np.nan)}, 'expected: 1)')])
 def test_third_sensor_identifies_the_wrong_sign(topic, changes, cause):
     leg = replace(town().leg(), **{topic: changed(getattr(town(), topic), **changes)})
     (found,) = (r for r in calibrate(leg, settings(town())).reasons if r.code is Code.GYRO_SIGN)
     assert cause in found.text
     assert ('Set imu.mounting_rpy' in found.special_remedy) == (
-        'f_i' in changes and cause == 'instead of 1)')
+        'f_i' in changes and cause == 'expected: 1)')
 
 
 def test_mirrored_gyro_is_found_by_accelerations_with_few_fixes():

@@ -216,7 +216,7 @@ def test_too_little_data_is_reported_and_later_updates_work(exact, updates, chan
 
 
 @pytest.mark.parametrize(('yaw', 'turn_rates', 'why'), [
-    (math.pi / 2, 1.0, 'accelerations point to the right'),
+    (math.pi / 2, 1.0, 'accelerations of the vehicle point to the right'),
     (0.0, 0.0, 'all turn rates are zero')])
 def test_an_unusable_imu_is_reported_at_once(exact, yaw, turn_rates, why):
     drive = drive_of(yaw=yaw)

@@ -97,8 +97,8 @@ def test_without_tf2_msgs_the_error_names_the_package_to_install():
 def test_one_topic_cannot_be_odometer_and_reference(start):
     node = start({}, '-r', 'fix:=/odom', '-r', 'odometer:=/odom')
     assert node.wait() != 0
-    assert ('/odom is both odometer and fix: an odometer cannot be calibrated against itself; '
-            'remap one of them to another topic') in node.text
+    assert ('topic /odom is used as odometer and as fix: an odometer cannot be calibrated '
+            'against itself; remap one of them to another topic') in node.text
     assert 'Traceback' not in node.text
 
 

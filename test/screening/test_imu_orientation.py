@@ -88,10 +88,10 @@ def test_a_large_orientation_error_is_reported_with_side_and_size():
     # reported as observed, for any nominal value
     ahead, = orientation_reasons(ImuOrientation(0.0, 1 * DEG), np.pi)
     assert ahead.code is Code.ODOMETER_REVERSED
-    assert 'forwards in the IMU frame (yaw mounting +0 deg, ± 1, nominal +180)' in ahead.text
+    assert 'forwards in the IMU frame (yaw mounting +0 deg, ± 1, nominal +180 deg)' in ahead.text
     ahead, = orientation_reasons(ImuOrientation(0.0, 1 * DEG), 90 * DEG)
     assert ahead.code is Code.IMU_AXES
-    assert 'accelerations point forwards' in ahead.text
+    assert 'accelerations of the vehicle point forwards' in ahead.text
 
 
 def test_only_a_large_error_of_the_forward_axis_is_corrected():

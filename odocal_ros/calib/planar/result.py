@@ -171,8 +171,8 @@ def _fit_reasons(fit: Fit) -> list[Reason]:
     reasons = [] if fit.converged else [Reason(
         Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} iterations; '
         'its uncertainties were doubled',
-        'Check odometer.wheels, odometer.drive and the time offsets, and drive left and right '
-        'turns.')]
+        'Check odometer.wheels, odometer.drive, odometer.time_offset and gnss.time_offset, and '
+        'drive left and right turns.')]
     if fit.swapped:
         reasons.append(Reason(Code.WHEELS_SWAPPED, 'the mirrored positions fit the wheels better: '
                               'left and right wheels are swapped'))
@@ -181,7 +181,8 @@ def _fit_reasons(fit: Fit) -> list[Reason]:
         reasons.append(Reason(
             Code.NOT_CONVERGED, f'wheels and positions differ by {1e3 * fit.levels[noisy]:.0f} mm '
             f'per metre ({noisy}); the limit is {1e3 * NOISE_LIMIT:.0f} mm',
-            'Check the order of odometer.wheels, odometer.drive and the time offsets.'))
+            'Check the order of odometer.wheels, odometer.drive, odometer.time_offset and '
+            'gnss.time_offset.'))
     return reasons
 
 

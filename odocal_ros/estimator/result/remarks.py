@@ -55,8 +55,9 @@ POSE_OUTLIER_REMEDY = (
 LEVER_ARM_AXES = 'Axes: from base_link, x forward, y left, z up.'
 # other cause of a lever arm that deviates, by whether the axis is z
 OTHER_CAUSE = {
-    False: 'Slip in turns, with skid steering or tracks, has this effect: then keep the setting.',
-    True: 'On z, a body that rolls on its springs has this effect: then keep the setting.'}
+    False: 'Slip in turns (skid steering, tracks) also shifts x and y; if that is the cause, keep '
+           'the setting.',
+    True: 'Body roll on soft springs also shifts z; if that is the cause, keep the setting.'}
 # advice by whether imu.lever_arm is set
 IMU_ARM = {False: 'An imu.lever_arm that is not set has the same effect: set it first.',
            True: 'A wrong imu.lever_arm has the same effect: check it too.'}
