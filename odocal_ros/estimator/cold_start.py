@@ -34,6 +34,8 @@ from odocal_ros.nav.time_series import fit_robust_line
 
 MEDIAN_RADIUS = 1.18        # statistical: median of a two-dimensional normal error, in sigmas
 SECTION_LENGTH = 600.0      # s, judgement: a gyro that warms up has one bias for this time
+# rad, judgement: sigma beyond which a heading from accelerations may be wrong, and is unknown
+AMBIGUOUS_HEADING, MAX_HEADING_SIGMA = 0.1, 0.2
 
 
 class FittedTrack:
@@ -100,9 +102,8 @@ def _window_medians(t: Floats, t_fix: Floats, y: Floats) -> Floats:
         return np.zeros(len(t))
     window = np.floor((t_fix - t_fix[0]) / 20.0).astype(int)
     masks = [window == k for k in np.unique(window)]
-    out: Floats = np.interp(t, [np.median(t_fix[mask]) for mask in masks],
-                            [np.median(y[mask]) for mask in masks])
-    return out
+    at, medians = ([np.median(x[mask]) for mask in masks] for x in (t_fix, y))
+    return np.asarray(np.interp(t, at, medians))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,25 +127,27 @@ class Start:
     fix_scatter: float      # m, scatter of the fixes about the track
 
 
-def cold_start(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
-               yaw: float | None = None) -> Start:
+def cold_starts(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
+                configured_yaw: float) -> list[Start]:
     """
-    Return the first state of a cold start.
+    Return the first state of a leg, or two if accelerations give an ambiguous heading.
 
-    imu : IMU steps of the leg.   priors : of the gyro bias.   yaw : initial yaw mounting, rad,
-    instead of the one estimated from accelerations.
+    priors : of the gyro bias.   configured_yaw : rad, yaw mounting of the second state, or of the
+    only one without an accelerometer.
     """
     sections = _estimate_sections(leg, imu, priors)
-    K = float(np.average([section.track.K for section in sections],
-                         weights=[np.abs(np.diff(section.track.X)).sum() + 1e-9
-                                  for section in sections]))
+    paths = [np.abs(np.diff(section.track.X)).sum() + 1e-9 for section in sections]
+    K = float(np.average([section.track.K for section in sections], weights=paths))
     weight = np.array([1 / section.sigma**2 for section in sections])
-    sigma = 1 / np.sqrt(weight.sum()) if weight.any() else np.inf
-    if yaw is None:       # rad: beyond this sigma, the heading is ambiguous
+    sigma = float(1 / np.sqrt(weight.sum())) if weight.any() else np.inf
+    yaws = [configured_yaw]
+    if leg.has_accelerometer:
         rotations = [np.exp(1j * (section.psi - section.track.chi)) for section in sections]
-        yaw = float(np.angle(weight @ rotations)) if sigma <= 0.2 else 0.0
-    return Start(_join_sections(leg, sections, K, yaw), float(sigma),
-                 float(np.median([section.track.scatter for section in sections])))
+        yaw = float(np.angle(weight @ rotations)) if sigma <= MAX_HEADING_SIGMA else 0.0
+        is_ambiguous = min(sigma, abs(float(wrap(configured_yaw - yaw)))) > AMBIGUOUS_HEADING
+        yaws = [yaw, configured_yaw] if is_ambiguous else [yaw]
+    scatter = float(np.median([section.track.scatter for section in sections]))
+    return [Start(_join_sections(leg, sections, K, yaw), sigma, scatter) for yaw in yaws]
 
 
 def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Section]:

@@ -10,7 +10,7 @@ import numpy as np
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import NotPositive
-from odocal_ros.estimator.cold_start import cold_start, Start
+from odocal_ros.estimator.cold_start import cold_starts, Start
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.estimator.fit import Fit, fit, Trace, WARM_START_PASSES
@@ -21,15 +21,12 @@ from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.estimates import implausible_imu_reasons, refused_result
 from odocal_ros.estimator.result.outcome import make_result
-from odocal_ros.estimator.state import M, SPEED_OFFSET, State, YAW
-from odocal_ros.nav.rotations import wrap
+from odocal_ros.estimator.state import M, SPEED_OFFSET, State
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_yaw
 
-# rad, judgement: a heading from accelerations with a larger sigma may be wrong: the fit is then
-# also started at the configured yaw, and each of the two starts has this number of passes
-AMBIGUOUS_HEADING, TRIAL_PASSES = 0.1, 3
+TRIAL_PASSES = 3    # judgement: of each of two starts, before the more likely one continues
 # initial size (S28) of the scale error of an odometer inside the receiver, and shortest leg, s,
 # that starts with it: ten times the time constant with which satellites correct that odometer;
 # shorter legs do not determine its error. Tuned on six drives of 300 s in yards with an error of
@@ -101,16 +98,11 @@ def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fi
 
 def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> Fit:
     """Return the fit from the cold start, or from the configured yaw if it is more likely."""
-    nominal, has_accelerometer = nominal_yaw(config), problem.leg.has_accelerometer
-    leg, imu = problem.leg, problem.imu
-    start = cold_start(leg, imu, problem.priors, None if has_accelerometer else nominal)
-    starts, passes = [start], config.leg.compute_limit
-    if has_accelerometer and start.yaw_sigma > AMBIGUOUS_HEADING:
-        other = cold_start(leg, imu, problem.priors, nominal)
-        yaw_difference = wrap(other.state.constants[YAW] - start.state.constants[YAW])
-        starts += [other] * bool(abs(yaw_difference) > AMBIGUOUS_HEADING)
+    starts = cold_starts(problem.leg, problem.imu, problem.priors, nominal_yaw(config))
+    passes = config.leg.compute_limit
     if len(starts) == 1:
-        return fit(problem, start.state, _initial_levels(problem, start), passes, trace=trace)
+        return fit(problem, starts[0].state, _initial_levels(problem, starts[0]), passes,
+                   trace=trace)
     trials = (fit(problem, one.state, _initial_levels(problem, one), TRIAL_PASSES, trace=trace)
               for one in starts)
     warm_start = max(trials, key=lambda f: f.likelihood).summary()

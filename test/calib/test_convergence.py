@@ -16,7 +16,7 @@ from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.data.leg import part_of
 from odocal_ros.estimator import fit, smooth
 from odocal_ros.estimator.chain import solve, Solved
-from odocal_ros.estimator.cold_start import change_gyro_bias, cold_start
+from odocal_ros.estimator.cold_start import AMBIGUOUS_HEADING, change_gyro_bias, cold_starts
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors import point_rows, signals
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -24,7 +24,7 @@ from odocal_ros.estimator.fit import damp_step
 from odocal_ros.estimator.level_steps import prior_information
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.smoother import AMBIGUOUS_HEADING, best_fit
+from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import YAW
 from odocal_ros.nav.rotations import rotvec, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
@@ -127,7 +127,7 @@ def test_start_with_a_warming_gyro_is_level_in_each_part_with_fixes(gap, parts):
         leg = replace(leg, **{name: getattr(leg, name)[seen] for name in (
             't_fix', 'fixes_n', 'covariance_n', 'rounding_n')})
     problem = make_problem(leg, config)
-    start = cold_start(leg, problem.imu, problem.priors).state
+    start = cold_starts(leg, problem.imu, problem.priors, 0.0)[0].state
     true = truth(drive, config, leg)
     assert (start.t == true.t).all()
     assert len(np.unique(start.gyro_bias, axis=0)) == parts
@@ -146,7 +146,7 @@ def test_fit_starts_at_the_nominal_yaw_if_accelerations_do_not_give_a_heading():
     begin, end = (drive.leg().start_ns + s * 10**9 for s in (80, 115))
     leg = leg_of(part_of(drive.leg(), begin, end, begin), config)
     problem = make_problem(leg, config)
-    start = cold_start(leg, problem.imu, problem.priors)
+    start = cold_starts(leg, problem.imu, problem.priors, 0.0)[0]
     assert start.yaw_sigma > AMBIGUOUS_HEADING
     assert start.state.constants[YAW] == 0.0
     found = smooth(leg, config).estimates['yaw_mounting_angle']

@@ -15,7 +15,7 @@ from smoother_legs import leg_of, made, reason_texts, smoothed, truth
 
 from odocal_ros.calib.budget import total_covariance
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.cold_start import cold_start
+from odocal_ros.estimator.cold_start import cold_starts
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
@@ -180,7 +180,7 @@ def test_imu_worse_than_its_grade_is_reported():
 def test_last_step_of_an_unconverged_fit_widens_the_sigma():
     _, config, leg = made(**SHORT)
     problem = make_problem(leg, config)
-    start = cold_start(leg, problem.imu, problem.priors).state
+    start = cold_starts(leg, problem.imu, problem.priors, 0.0)[0].state
     start.constants[YAW] += 0.1         # far from the solution, with one pass only
     method = make_result(leg, problem, fit(problem, start, problem.initial_levels, 1), config)
     move = float(re.search('after 1 iterations the estimates still changed by ([^ ]+) sigma',

@@ -14,7 +14,7 @@ from smoother_legs import made, truth
 from odocal_ros.data.arrays import MAX_RESIDENT_BYTES, release_mapped_memory, work_array
 from odocal_ros.estimator import cramer_rao_bound
 from odocal_ros.estimator.chain import Normal, NotPositive, solve
-from odocal_ros.estimator.cold_start import cold_start
+from odocal_ros.estimator.cold_start import cold_starts
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors.axle import mean_rates_at
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -200,7 +200,7 @@ def peak_of_a_pass(duration):
     """Return the number of keyframes and the peak, bytes, of a pass with correlated fix errors."""
     _, config, leg = made(scenario='town', duration=duration, imu_rate=25.0, fix_rate=1.0)
     problem = make_problem(leg, config)
-    state = cold_start(leg, problem.imu, problem.priors).state
+    state = cold_starts(leg, problem.imu, problem.priors, 0.0)[0].state
     levels = problem.initial_levels.replaced(correlation_time=60.0)
     tracemalloc.start()
     weighted = Weighted(Equations(problem, state), levels)
