@@ -22,7 +22,7 @@ from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.messages.raws import RawMessages, Rows
 from odocal_ros.safe_io.limits import Damaged, LATEST_NS
 
-BLOCK = 2**21          # judgement: bytes of chunks unpacked at a time
+BLOCK_BYTES = 2**21          # judgement: bytes of chunks unpacked at a time
 # format: of a message record, before the message: mcap.dev/spec
 HEAD = np.dtype([('op', 'u1'), ('size', '<i8'), ('channel', '<u2'), ('sequence', '<u4'),
                  ('time_ns', '<i8'), ('published_ns', '<i8')])
@@ -41,8 +41,8 @@ class Columns(NamedTuple):
         return Columns(self.time_ns[rows], self.channel[rows], self.raws.take(rows))
 
 
-Block = list[Chunk | Damaged]      # chunks of a block; the damage of those not readable
-ReadChunks = Callable[[Sequence[ChunkIndex]], Block]     # reads adjacent chunks
+ChunkBlock = list[Chunk | Damaged]      # chunks; the damage of those not readable
+ReadChunks = Callable[[Sequence[ChunkIndex]], ChunkBlock]     # reads adjacent chunks
 # returns time, channel and bytes of each message, or raises Damaged
 ScanChunk = Callable[[Chunk], Sequence[tuple[int, int, bytes]]]
 ReportDamage = Callable[[Damaged], None]
@@ -59,61 +59,64 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
     """
     is_requested, is_known = _channel_mask(channels), _channel_mask(known_channels)
     later: Columns | None = None         # messages that may be later than those of the next chunk
-    number, size = 0, 1           # the first block is one chunk, which is often sufficient
-    while number < len(index):
-        block, number = _read_block(index, number, size, read_chunks)
+    next_chunk, min_bytes = 0, 1      # the first block is one chunk, which is often sufficient
+    while next_chunk < len(index):
+        block, next_chunk = _read_block(index, next_chunk, min_bytes, read_chunks)
         columns = _columns(block, is_known, scan, report_damage)
         if len(channels) < len(known_channels):
             columns = columns.take(is_requested[columns.channel])
         columns = _join(later, columns) if later else columns
         if (columns.time_ns[1:] < columns.time_ns[:-1]).any():
             columns = columns.take(np.argsort(columns.time_ns, kind='stable'))
-        next_ns = index[number].start_ns if number < len(index) else LATEST_NS
+        next_ns = index[next_chunk].start_ns if next_chunk < len(index) else LATEST_NS
         end = int(np.searchsorted(columns.time_ns, next_ns))
         later = columns.take(slice(end, None)) if end < len(columns.time_ns) else None
         if end:
             yield _batch(columns.take(slice(end)), channels)
-        size = BLOCK + int(later.raws.size.sum() if later else 0)
+        # a block as large as what it may wait for: else many chunks that overlap are joined again
+        min_bytes = BLOCK_BYTES + int(later.raws.size.sum() if later else 0)
 
 
-def _read_block(index: Sequence[ChunkIndex], number: int, size: int,
-                read_chunks: ReadChunks) -> tuple[Block, int]:
+def _read_block(index: Sequence[ChunkIndex], number: int, min_bytes: int,
+                read_chunks: ReadChunks) -> tuple[ChunkBlock, int]:
     """
-    Return chunks from a number on, of ``size`` bytes or more, and the number after them.
+    Return the chunks from index ``number`` on, at least ``min_bytes``, and the index after them.
 
-    Chunks that overlap these in time are added, up to BLOCK more bytes.
+    Chunks that overlap these in time are added, up to BLOCK_BYTES more bytes.
     """
-    block: Block = []
-    remaining, end_ns = size, 0
-    first, range_end = number, 0      # of a range of chunks that are adjacent in the file
+    block: ChunkBlock = []
+    remaining, end_ns = min_bytes, 0
+    # of a range of chunks that are adjacent in the file
+    first, range_end = number, index[number].offset
     while number < len(index) and (
-            remaining > 0 or index[number].start_ns < end_ns and remaining > -BLOCK):
+            remaining > 0 or (index[number].start_ns < end_ns and remaining > -BLOCK_BYTES)):
         entry = index[number]
         if entry.offset != range_end:
-            block += read_chunks(index[first:number]) if number > first else []
+            block += read_chunks(index[first:number])
             first = number
         range_end = entry.offset + entry.size + entry.index_size
+        # the larger one: a wrong index may state 0 for the unpacked size
         remaining -= max(entry.size, entry.unpacked_size)
         end_ns, number = max(end_ns, entry.end_ns), number + 1
     return block + read_chunks(index[first:number]), number
 
 
-def _columns(block: Block, known_channels: Bools, scan: ScanChunk,
+def _columns(block: ChunkBlock, is_known: Bools, scan: ScanChunk,
              report_damage: ReportDamage) -> Columns:
     """Return the messages of chunks; where the index is unexpected by a sequential scan."""
     chunks = [chunk for chunk in block if isinstance(chunk, Chunk)]
-    columns = _columns_by_index(chunks, known_channels)
+    columns = _columns_by_index(chunks, is_known)
     parts = []
     for chunk in block:
-        try:
-            if isinstance(chunk, Damaged):
-                raise chunk
-            if columns is None:
-                parts.append(_columns_by_index([chunk], known_channels)
-                             or _columns_of_messages(scan(chunk)))
-        except Damaged as error:
-            report_damage(error)
-    return columns or _join(*parts)
+        if isinstance(chunk, Damaged):
+            report_damage(chunk)
+        elif columns is None:
+            try:
+                part = _columns_by_index([chunk], is_known)
+                parts.append(_columns_of_messages(scan(chunk)) if part is None else part)
+            except Damaged as error:
+                report_damage(error)
+    return _join(*parts) if columns is None else columns
 
 
 def _channel_mask(channel_numbers: Collection[int]) -> Bools:
@@ -123,7 +126,7 @@ def _channel_mask(channel_numbers: Collection[int]) -> Bools:
     return mask
 
 
-def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns | None:
+def _columns_by_index(chunks: Sequence[Chunk], is_known: Bools) -> Columns | None:
     """Return the messages of chunks; None if any of them has an unexpected layout."""
     chunks = _concatenated(chunks)
     offsets = [_record_offsets(chunk) for chunk in chunks]
@@ -137,7 +140,9 @@ def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns
     # a view with a head at every offset of the buffer; only those of records are read
     offset_count = len(data) - HEAD.itemsize + 1
     head = np.ndarray((offset_count,), f'V{HEAD.itemsize}', data, 0, (1,))[start].view(HEAD)
-    end = counts.cumsum()       # row after the last message of each chunk
+    # row after the last message of each chunk; if the sorted records of chunks are mixed, a record
+    # is not adjacent to the one before
+    end = counts.cumsum()
     first = end - counts
     stop = np.append(start[1:], 0)
     stop[end - 1] = [chunk.stop for chunk in chunks]
@@ -147,14 +152,14 @@ def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns
         and size.min() >= COUNTED_HEAD
         and start[first].tolist() == [chunk.begin for chunk in chunks])
     time_ns, channel = head['time_ns'].copy(), head['channel'].copy()
-    if not (is_adjacent and known_channels[channel].all() and _are_times_as_stated(
+    if not (is_adjacent and is_known[channel].all() and _are_times_as_stated(
             chunks, time_ns, first)):
         return None
     return Columns(time_ns, channel, RawMessages(data, start + HEAD.itemsize, size - COUNTED_HEAD))
 
 
 def _are_times_as_stated(chunks: Sequence[Chunk], time_ns: Ints, first: Ints) -> bool:
-    """Return True if messages are within the times of their chunks; first : row of each chunk."""
+    """Return True if messages are within the times of their chunks; first : row of their first."""
     earliest, latest = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
     return all(high < LATEST_NS
                and chunk.start_ns <= low <= high <= max(chunk.end_ns, chunk.start_ns)
@@ -177,13 +182,14 @@ def _concatenated(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
 def _record_offsets(chunk: Chunk) -> Ints:
     """Return the offsets of the records of a chunk from its message index, in any order."""
     offsets, position, index = [np.empty(0, np.int64)], 0, chunk.message_index
-    head = struct.Struct('<BQHI')      # opcode, size, channel, bytes of (time, offset) pairs
+    # opcode, size of the rest, channel, bytes of pairs; then 8 bytes of time and of offset each
+    head = struct.Struct('<BQHI')
     while position + head.size <= len(index):
         op, size, _, length = head.unpack_from(index, position)
         pairs = position + head.size
         if op != MESSAGE_INDEX or size != length + 6 or length % 16 or (
                 pairs + length > len(index)):
-            break
+            break      # of a damaged index offsets are missing: _columns_by_index rejects them
         offsets.append(np.frombuffer(index, '<i8', length // 8, pairs)[1::2])
         position = pairs + length
     return np.concatenate(offsets) + chunk.begin
@@ -200,13 +206,13 @@ def _join(*parts: Columns) -> Columns:
     if not parts:
         return _columns_of_messages([])
     packed = [part.raws.packed() for part in parts]
-    base = np.cumsum([0, *(len(raws.data) for raws in packed)])
+    base = np.cumsum([0, *(len(raws.data) for raws in packed[:-1])])
     return Columns(
         np.concatenate([part.time_ns for part in parts]),
         np.concatenate([part.channel for part in parts]),
         RawMessages(b''.join([raws.data for raws in packed]),
                     np.concatenate([raws.start + offset
-                                    for raws, offset in zip(packed, base, strict=False)]),
+                                    for raws, offset in zip(packed, base, strict=True)]),
                     np.concatenate([raws.size for raws in packed])))
 
 

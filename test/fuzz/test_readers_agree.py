@@ -80,7 +80,7 @@ def test_both_readers_agree_on_simulated_bags(clean, monkeypatch, name):
 @pytest.mark.parametrize('form', ['zstd', 'lz4', ''])
 @pytest.mark.parametrize('lengths', [1, 7])
 def test_both_readers_agree_on_overlapping_chunks(tmp_path, monkeypatch, walked, form, lengths):
-    monkeypatch.setattr(mcap_columns, 'BLOCK', 4000)
+    monkeypatch.setattr(mcap_columns, 'BLOCK_BYTES', 4000)
     if form != 'zstd':
         monkeypatch.setattr(mcap_write, '_packed', lambda records: (
             form, frame.compress(records) if form else records))
