@@ -26,7 +26,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from harness import configured, parsed, read_rows, run_missing
 import numpy as np
-from zoo import GRADES, KINDS
+from zoo import DRAWN_GRADES, KINDS
 from zoo_table import BY_KIND, NEVER_FALSE
 
 FIRST_SEED, SEEDS_A_RUN = 80_000_000, 1_000_000
@@ -89,8 +89,8 @@ FAULTS: dict = {
                              {'imu_grade': 'consumer'}, {}, {'imu.grade': 'tactical'}, None),
     'IMU_AXES_SKEW': ('industrial, accelerometer x 1 deg off', 'town',
                       {'imu_grade': 'industrial'}, {'accel_matrix': matrix(DEG)}, {}, None),
-    'FIXES_NOISIER_THAN_SAID': ('1.5 m, stated 0.5 m', 'town', {}, {'stated_factor': 1 / 3}, {},
-                                None),
+    'FIXES_NOISIER_THAN_SAID': ('1.5 m, stated 0.5 m', 'town', {}, {'stated_sigma_ratio': 1 / 3},
+                                {}, None),
     'FIXES_SMOOTHED': ('first order, 0.6 s', 'town', {}, {'receiver_lag': 0.6}, {}, None),
     'DELAY_SEEN': ('fixes 0.3 s late', 'town', {'fix_delay': 0.3}, {}, {}, None),
     'ODOMETER_LATE': ('ten bursts, 0.1 to 0.5 s', 'town', {}, {}, {}, delayed_in_bursts),
@@ -137,7 +137,7 @@ def run_drive(seed, duration):
     from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.scenarios import simulate
     e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
-    code, grade = RUNS[e], GRADES[k % len(GRADES)]
+    code, grade = RUNS[e], DRAWN_GRADES[k % len(DRAWN_GRADES)]
     if code == 'clean':
         kind, real, settings, change = KINDS[k % len(KINDS)], {}, {}, None
         options = {'two_wheels': k % 2 == 1} | (RTK if k // 2 % 2 else {})

@@ -42,9 +42,9 @@ def _argument(one):
 def configured(drive):
     """Return the settings that the vehicle's operator has."""
     from odocal_ros.settings.config import Config, with_settings
-    from odocal_ros.sim.truth import settings
+    from odocal_ros.sim.truth import operator_settings
     return with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
-                                    for group, keys in settings(drive).items()
+                                    for group, keys in operator_settings(drive).items()
                                     for key, v in keys.items()})
 
 

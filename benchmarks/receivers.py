@@ -117,7 +117,8 @@ def saturated(drive, leg, rng):
     return replace(leg, imu=replace(leg.imu, f_i=np.clip(leg.imu.f_i, -2 * G, 2 * G)))
 
 
-ROBOT = {'cross_slope': 2 * DEG, 'cross_slope_length': 20.0, 'kerbs': 0.08, 'wheelbase': 0.5}
+ROBOT = {'alternating_crossfall': 2 * DEG, 'alternating_crossfall_length': 20.0, 'kerbs': 0.08,
+         'wheelbase': 0.5}
 SHAKEN = ('IMU_WORSE_THAN_GRADE', 'MODEL_MISMATCH')
 RUNS = {
     'plain': Run(kinds=(*ROADS, 'yard')),
@@ -142,7 +143,7 @@ RUNS = {
                                     also=('FIXES_NOISIER_THAN_SAID',)),
     'oval, left turns only': Run(kinds=('oval',)),
     'banked oval': Run({'banking': 0.5}, kinds=('oval',)),
-    'crossfall, 2.5 %': Run({'crossfall': 0.025}, effects=('squat', 'sideslip')),
+    'crossfall, 2.5 %': Run({'constant_crossfall': 0.025}, effects=('squat', 'sideslip')),
     'kneeling bus': Run({'kneeling': 2 * DEG}, kinds=('town',), effects=('squat',)),
     'lost IMU rows': Run(change=lost),
     'IMU clock 50 ppm': Run({'odometer_clock_rate': -5e-5, 'fix_clock_rate': -5e-5},

@@ -35,7 +35,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from harness import configured, parsed, read_rows, run_missing
 from zoo_table import print_tables
 
-from odocal_ros.sim.draw import draw_vehicle, EFFECTS, GRADES, KINDS, RARE
+from odocal_ros.sim.draw import draw_vehicle, DRAWN_GRADES, EFFECTS, KINDS, RARE
 
 CLEAN = 'clean'
 RUNS = ('all', *EFFECTS, CLEAN, *RARE)     # in the order of their seeds
@@ -60,7 +60,7 @@ def kind_of(k):
 
 def grade_of(k):
     """Return the grade of a run's drive k: five kinds, three grades, each pair once in 15."""
-    return GRADES[k % len(GRADES)]
+    return DRAWN_GRADES[k % len(DRAWN_GRADES)]
 
 
 def run_drive(seed, duration=None):
@@ -139,7 +139,7 @@ def main():
                   only={'choices': RUNS[1:], 'action': 'append', 'default': [],
                         'metavar': 'EFFECT',
                         'help': f'one effect alone; repeatable: {", ".join(RUNS)}'},
-                  kind={'choices': KINDS}, grade={'choices': GRADES},
+                  kind={'choices': KINDS}, grade={'choices': DRAWN_GRADES},
                   duration=(float, 's of a drive (600; straight 720)'), jobs=(2, 'processes'),
                   file=Path('/tmp/zoo.jsonl'))
     if args.duration is not None and not math.isfinite(args.duration):

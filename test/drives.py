@@ -16,7 +16,7 @@ from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
-from odocal_ros.sim.truth import settings as true_settings
+from odocal_ros.sim.truth import operator_settings
 
 ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')
 LOW_RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0}
@@ -75,7 +75,7 @@ def settings(made, heading_sigma=1e-3, **changes):
 def configured(made):
     """Return the settings that the operator of a drawn vehicle has."""
     return with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
-                                    for group, keys in true_settings(made).items()
+                                    for group, keys in operator_settings(made).items()
                                     for key, v in keys.items()})
 
 

@@ -17,7 +17,7 @@ from odocal_ros.safe_io.text_formats import for_comment, one_line
 from odocal_ros.sim import scenarios
 from odocal_ros.sim.fleet import drive_options, fleet_of, FleetVehicle, MODELS, with_broken_counter
 from odocal_ros.sim.scenarios import Drive, SimOptions
-from odocal_ros.sim.truth import settings, truth_entries
+from odocal_ros.sim.truth import operator_settings, truth_entries
 
 TRUTH, SETTINGS, MANIFEST = 'truth.yaml', 'calibrator.yaml', 'manifest.csv'
 MADE_HERE = 'Made by odocal simulate.'
@@ -52,7 +52,7 @@ def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None,
     if out is not None:
         write_bag(out, drive_topics(drive), storage, compression, force, progress)
         truth, operator = truth_paths(out)
-        node = {'/**/calibrator': {'ros__parameters': settings(drive, heading_sigma)}}
+        node = {'/**/calibrator': {'ros__parameters': operator_settings(drive, heading_sigma)}}
         with uninterrupted():      # a bag is never without its truth
             write_yaml(truth, truth_entries(drive, out.name), f'Truth of {out.name}.')
             write_yaml(operator, node, f'Settings of the operator of {out.name}.')
@@ -124,7 +124,7 @@ def simulate_fleet(out: Path, options: SimOptions, vehicles: int, bags: int, *,
                          'odometer_km': f'{vehicle.odometer_km[bag]:.1f}'})
             drives.append(drive)
         if number < len(MODELS):      # the first vehicle of each model
-            node = {'/**/calibrator': {'ros__parameters': settings(drives[0], None)}}
+            node = {'/**/calibrator': {'ros__parameters': operator_settings(drives[0], None)}}
             write_yaml(out / rows[-1]['config'], node,
                        f'Settings of the operator of a {vehicle.model.name}.')
         truth.append(_truth(vehicle, drives))

@@ -15,7 +15,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy, rotate, rotate_back
 from odocal_ros.sim.motion import inertial_v, Motion, State
 from odocal_ros.sim.profile import hermite, Hills, Profile
 from odocal_ros.sim.real_effects import RealEffects
-from odocal_ros.sim.zoo import G
+from odocal_ros.sim.vehicle_distributions import G
 
 # physical: natural frequency of a car's body on its springs, damped by shock absorbers
 FREQUENCY = 2 * np.pi * 1.3   # rad/s
@@ -69,8 +69,8 @@ def road_lean(speed: Profile, yaw_rate: Profile, real: RealEffects) -> Profile:
     """Return the lean of the road to the right by time, rad."""
     step = 0.005 if real.kerbs else 0.02    # s, as above
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
-    cross = Hills(real.cross_slope, real.cross_slope_length)
-    lean = (real.crossfall + cross(speed.integral()(t))[0]
+    cross = Hills(real.alternating_crossfall, real.alternating_crossfall_length)
+    lean = (real.constant_crossfall + cross(speed.integral()(t))[0]
             - real.banking * np.arctan(speed(t) * yaw_rate(t) / G))
     return hermite(t, lean, np.gradient(lean, step))
 

@@ -20,7 +20,7 @@ from odocal_ros.sim.draw_effects import EFFECTS, RARE
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real_effects import RealEffects
-from odocal_ros.sim.zoo import BY_GRADE, flat, GRADES, Vehicle
+from odocal_ros.sim.vehicle_distributions import BY_GRADE, DRAWN_GRADES, flat, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')    # scenarios of the zoo
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each defines the only odometer
@@ -38,9 +38,9 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
 
     Raises BadUsage: a name is unknown, or two effects exclude each other.
     """
-    if grade not in GRADES:
+    if grade not in DRAWN_GRADES:
         raise BadUsage(f'--vehicle real with --imu-grade {grade}: required: one of '
-                       f'{", ".join(GRADES)}')
+                       f'{", ".join(DRAWN_GRADES)}')
     names = list(EFFECTS) if effects is None else list(effects)
     for name in names:
         if name not in EFFECTS | RARE:
@@ -73,7 +73,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
 def _ideal_vehicle(seed: int, kind: str, grade: str,
                    effects_requested: bool) -> tuple[Vehicle, dict[str, Any]]:
     """Return a drawn vehicle and its SimOptions before any effect; numbers: docs/zoo.md."""
-    rng, grade_index = make_rng(seed, 'vehicle'), GRADES.index(grade)
+    rng, grade_index = make_rng(seed, 'vehicle'), DRAWN_GRADES.index(grade)
     roll, pitch, yaw = (math.radians(sigma) * rng.standard_normal()
                         for sigma in BY_GRADE['mounting'][grade_index])
     heading, slope = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.02)

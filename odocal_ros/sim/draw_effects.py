@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from odocal_ros.settings.nominal import GRADES
-from odocal_ros.sim.zoo import DEG, Effect, flat, G, KMH, lognormal, MG, Vehicle
+from odocal_ros.sim.vehicle_distributions import DEG, Effect, flat, G, KMH, lognormal, MG, Vehicle
 
 # judgement: turn-on bias of the accelerometer's axes over that of the grade (docs/zoo.md)
 AXIS_RATIOS = [1, 1, 1.3]
@@ -47,8 +47,8 @@ def bias(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
         'gyro_bias': flat(rng.normal(0.0, vehicle.grade_value('gyro bias'), 3)),
         'accel_bias': flat(
             rng.normal(0.0, vehicle.grade_value('accelerometer bias'), 3) * AXIS_RATIOS),
-        'gyro_wander': vehicle.grade_value('gyro wander'),
-        'accel_wander': vehicle.grade_value('accelerometer wander')})
+        'gyro_instability': vehicle.grade_value('gyro instability'),
+        'accel_instability': vehicle.grade_value('accelerometer instability')})
 
 
 def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
@@ -75,8 +75,9 @@ def vibration(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
 
 def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Delay stamps by filter and transport, with jitter, in batches."""
-    shortest, longest = vehicle.grade_value('filter')
-    latency = rng.uniform(shortest, longest) + lognormal(rng, *vehicle.grade_value('latency'))
+    shortest, longest = vehicle.grade_value('imu filter delay')
+    latency = rng.uniform(shortest, longest) + lognormal(
+        rng, *vehicle.grade_value('stamp latency'))
     batches = vehicle.grade == 'industrial' and rng.uniform() < 0.3
     return Effect(real={
         'imu_latency': float(latency), 'imu_jitter': vehicle.grade_value('imu jitter'),
@@ -195,7 +196,7 @@ def multipath(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
 def covariance(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """State sigmas that are not the true ones; in a city most are too small."""
     optimism = lognormal(rng, *((3.0, 0.7) if vehicle.city and not vehicle.rtk else (1.3, 0.5)))
-    return Effect(real={'stated_factor': 1 / optimism})
+    return Effect(real={'stated_sigma_ratio': 1 / optimism})
 
 
 def outages(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
@@ -258,9 +259,9 @@ def reflections(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
 
 def kerbs(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Drive on ground with cross slopes; in a yard over kerbs too."""
-    slopes = {'cross_slope': float(DEG * rng.uniform(1.0, 2.0))}
+    slopes = {'alternating_crossfall': float(DEG * rng.uniform(1.0, 2.0))}
     if vehicle.kind != 'yard':
-        return Effect(real=slopes | {'cross_slope_length': 200.0, 'wheelbase': 2.7})
+        return Effect(real=slopes | {'alternating_crossfall_length': 200.0, 'wheelbase': 2.7})
     return Effect(real=slopes | {'kerbs': float(rng.uniform(0.04, 0.08)), 'wheelbase': 0.5})
 
 

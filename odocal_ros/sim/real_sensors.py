@@ -90,13 +90,13 @@ def drift_and_vibration(t: Floats, speed: Floats, options: SimOptions) -> list[F
     warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
     by_sensor = []
     for name, rms in (('gyro', real.gyro_vibration), ('accel', real.vibration)):
-        slope, wander = getattr(real, f'{name}_slope'), getattr(real, f'{name}_wander')
+        slope, sigma = getattr(real, f'{name}_slope'), getattr(real, f'{name}_instability')
         total = warmth * np.array(slope) if real.warm_rise and any(slope) else 0.0
         if any(step := getattr(real, f'{name}_step')):
             total = total + (t >= real.bias_step_at)[:, None] * np.array(step)
-        if wander:
-            total = total + _wander(make_rng(options.seed, f'real {name} wander'), wander,
-                                    real.wander_time, t)
+        if sigma:
+            total = total + _instability(make_rng(options.seed, f'real {name} wander'), sigma,
+                                         real.instability_time, t)
         if rms:
             share = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + 5.0)    # half at 5 m/s
             total = total + share * vibration(make_rng(options.seed, f'real {name} vibration'),
@@ -107,7 +107,7 @@ def drift_and_vibration(t: Floats, speed: Floats, options: SimOptions) -> list[F
     return by_sensor
 
 
-def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
+def _instability(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
     """Return a Gauss-Markov process that starts at 0, linear between draws."""
     knots = np.arange(0.0, t[-1] + 2.0, 1.0)    # s
     x = gauss_markov(rng, sigma, tau, knots)

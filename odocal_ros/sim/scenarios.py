@@ -126,7 +126,7 @@ def motion_of(options: SimOptions) -> Motion:
     optional: dict[str, Any] = {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
     lean = (body.road_lean(route.speed, route.yaw_rate, real)
-            if real.cross_slope or real.banking or real.crossfall else None)
+            if real.alternating_crossfall or real.banking or real.constant_crossfall else None)
     if lean:
         optional['lean'] = lean
     if route.side is not None:

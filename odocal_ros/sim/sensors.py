@@ -222,7 +222,7 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     # of east, north and up, without bursts
     variance = (_axis_sigmas(options) ** 2 * variance_ratio + noise.stationary_sigma(options)**2
                 + slow_variance * np.array([1.0, 1.0, real_sensors.UP_RATIO**2]))
-    variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
+    variance = np.maximum(variance * real.stated_sigma_ratio**2, SIGMA_FLOOR**2)
     if REFERENCES[options.reference].is_planar:
         variance[2] = 0.0
     n = len(t)

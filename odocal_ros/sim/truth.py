@@ -32,7 +32,7 @@ def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
                   'unit': drive.form.scale_unit, 'nominal': options.nominal_scale,
                   'wheels': list(truth.wheel_scales)},
         **_wheels(drive),
-        **_robot(options),
+        **_robot_entries(options),
         'yaw_mounting_deg': {'value': math.degrees(truth.yaw)},
         'pitch_mounting_deg': {'value': math.degrees(truth.pitch)},
         # the angles above are those of the sensor axes, these of the housing: equal if the axes
@@ -57,6 +57,7 @@ def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
 
 
 def _topics(drive: Drive) -> dict[str, Any]:
+    """Return the topics of the bag, by input."""
     odometer: Any = '/odometer'
     if drive.options.odometer == 'angle':
         odometer = '/joint_states'
@@ -76,7 +77,8 @@ def _wheels(drive: Drive) -> dict[str, Any]:
             } if len(wheels) > 1 else {}
 
 
-def _robot(options: SimOptions) -> dict[str, Any]:
+def _robot_entries(options: SimOptions) -> dict[str, Any]:
+    """Return track width and lateral scale of a skid-steer, mecanum or omni robot."""
     if options.drive == DIFFERENTIAL:
         return {}
     width = effective_width(options)
@@ -84,7 +86,7 @@ def _robot(options: SimOptions) -> dict[str, Any]:
     if options.drive == MECANUM:
         entries |= {'lateral_scale_factor': SIDEWAYS * options.scale}
     elif options.drive == SKID:
-        entries |= {'track_width_arc': effective_width(options, 2 * width)}
+        entries |= {'track_width_arc': effective_width(options, radius=2 * width)}
     return {'robot': entries}
 
 
@@ -101,7 +103,8 @@ def _configured_arm(options: SimOptions, name: str) -> list[float]:
     return [float(x + e) for x, e in zip(true, error, strict=True)]
 
 
-def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str, dict[str, Any]]:
+def operator_settings(drive: Drive, known_heading_sigma: float | None = None,
+                      ) -> dict[str, dict[str, Any]]:
     """Return an operator's settings by group; a known heading has a random error, rad."""
     options = drive.options
     grade = options.real.configured_grade or options.imu_grade
@@ -130,7 +133,7 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str
 
 
 def topic_arguments(drive: Drive) -> list[str]:
-    """Return the topic options replay needs if the type is not unique."""
+    """Return the topic options that replay needs if several topics have the same type."""
     arguments = []
     if len(drive.wheels) > 1 and drive.options.odometer == 'counts':
         arguments += ['--odometer-topic', '/odometer/left',

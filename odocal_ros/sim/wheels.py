@@ -19,7 +19,7 @@ from odocal_ros.sim.motion import contact_speed, State, turn_rate
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real_effects import RealEffects
-from odocal_ros.sim.zoo import G
+from odocal_ros.sim.vehicle_distributions import G
 
 AXLES = {1: ('rear',), 2: ('front', 'rear'), 3: ('front', 'middle', 'rear'),
          4: ('front', 'second', 'third', 'rear')}

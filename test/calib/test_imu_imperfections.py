@@ -238,7 +238,7 @@ def test_wrong_lever_arm_is_not_unobservable_but_a_delay_without_a_value_is():
 
 
 def test_vehicle_effects_beside_the_values_are_reported():
-    real = RealEffects(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
+    real = RealEffects(receiver_lag=0.8, speed_law=0.006, stated_sigma_ratio=0.5)
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='industrial', seed=4,
                               fix_noise='rtk', real=real, antenna_lever_arm=(0.8, 0.0, 1.0))
     moved = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})

@@ -18,7 +18,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions, simulate
-from odocal_ros.sim.truth import settings
+from odocal_ros.sim.truth import operator_settings
 
 pytestmark = pytest.mark.slow
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
@@ -85,7 +85,7 @@ def test_the_prediction_is_the_sigma_of_the_result(scenario, source):
     options = resolved(SimOptions(scenario=scenario, imu_grade=grade, imu_rate=20.0,
                                   odometer_rate=20.0, fix_rate=4.0, seed=5, pitch=0.0))
     drive = simulate(options)
-    groups = settings(drive, HEADING if source == 'fixed' else None)
+    groups = operator_settings(drive, HEADING if source == 'fixed' else None)
     settled = with_settings(Config(), {
         f'{group}.{name}': value for group, values in groups.items()
         for name, value in values.items()} | {

@@ -23,7 +23,7 @@ from odocal_ros.pipeline.planar_run import shortened_by_slopes
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
-from odocal_ros.sim.truth import settings
+from odocal_ros.sim.truth import operator_settings
 from odocal_ros.sim.wheels import effective_width, SIDEWAYS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,7 +37,7 @@ def driven(drive='differential', **more):
     options = {'scenario': 'indoor', 'reference': 'mocap', 'fix_rate': 10.0, 'odometer': 'angle',
                'imu': False, 'slip_walk': 5e-4, 'drive': drive, 'duration': 120.0} | more
     made = simulate(SimOptions(**options))
-    odometer = settings(made)['odometer']
+    odometer = operator_settings(made)['odometer']
     odometer.pop('lever_arm')
     return made, with_settings(Config(), {f'odometer.{k}': v for k, v in odometer.items()})
 

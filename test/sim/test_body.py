@@ -13,7 +13,7 @@ from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.profile import chain, Hills, hold, ramp, turn
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
-from odocal_ros.sim.zoo import G
+from odocal_ros.sim.vehicle_distributions import G
 
 pytestmark = pytest.mark.core
 KERBS = ((5.0, 0.08), (9.0, -0.08))
@@ -53,7 +53,7 @@ def test_the_body_climbs_kerbs_with_both_axles():
 def test_a_cross_slope_rolls_the_vehicle_and_gives_lateral_gravity():
     lean = np.radians(2.0)
     drive = simulate(SimOptions(scenario='yard', duration=120.0, imu_grade='perfect', pitch=0.0,
-                                yaw=0.0, real=RealEffects(cross_slope=lean)))
+                                yaw=0.0, real=RealEffects(alternating_crossfall=lean)))
     t = (drive.imu.stamp_ns - drive.imu.stamp_ns[0]) * 1e-9
     still = np.abs(drive.motion.speed(t)) == 0
     roll = np.arctan2(drive.imu.f_i[still, 1], drive.imu.f_i[still, 2])
@@ -167,7 +167,7 @@ def test_rear_axle_sideslip_is_outwards_by_the_lateral_acceleration():
 
 def test_on_a_cross_slope_the_body_rolls_and_the_axle_slips_downhill():
     fall, straight = 0.025, {'scenario': 'straight', 'duration': 190.0}
-    real = RealEffects(crossfall=fall, body_roll=ROLL, sideslip=0.004)
+    real = RealEffects(constant_crossfall=fall, body_roll=ROLL, sideslip=0.004)
     motion = motion_of(resolved(SimOptions(**straight, odometer_lever_arm=(0.0, 0.0, 0.0),
                                            real=real)))
     t = np.arange(0.0, 190.0, 0.1)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.sim.draw import draw_vehicle, EFFECTS, GRADES, KINDS, ODOMETER_EFFECTS, RARE
+from odocal_ros.sim.draw import draw_vehicle, DRAWN_GRADES, EFFECTS, KINDS, ODOMETER_EFFECTS, RARE
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import simulate
-from odocal_ros.sim.truth import settings
+from odocal_ros.sim.truth import operator_settings
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +22,8 @@ def test_a_clean_vehicle_has_no_imperfections_and_the_true_settings():
     options, there = draw_vehicle(7, 'town', 'industrial', ())
     assert options.real == RealEffects()
     assert there == ()
-    configured = settings(simulate(draw_vehicle(7, 'town', 'industrial', (), duration=200.0)[0]))
+    configured = operator_settings(
+        simulate(draw_vehicle(7, 'town', 'industrial', (), duration=200.0)[0]))
     assert configured['imu']['grade'] == 'industrial'
     for group, name in (('imu', 'imu'), ('gnss', 'antenna'), ('odometer', 'odometer')):
         assert configured[group]['lever_arm'] == list(getattr(options, f'{name}_lever_arm'))
@@ -52,7 +53,7 @@ def test_a_rare_effect_is_drawn_only_if_it_is_named(name):
     assert name not in draw_vehicle(7, 'town', 'industrial')[1]
 
 
-@pytest.mark.parametrize(('kind', 'grade'), zip(KINDS, cycle(GRADES)))
+@pytest.mark.parametrize(('kind', 'grade'), zip(KINDS, cycle(DRAWN_GRADES)))
 def test_a_drawn_vehicle_can_be_driven(kind, grade):
     duration = 320.0 if kind == 'out_and_back' else 260.0
     options, there = draw_vehicle(11, kind, grade, duration=duration, imu_rate=20.0)

@@ -59,8 +59,8 @@ def test_satellite_errors_are_smoothed_by_an_odometer_in_the_receiver():
 
 def test_slow_errors_have_their_size_and_are_in_the_covariance():
     slow = ((1.2, 5.0), (0.9, 20.0))
-    options = replace(PAPER, fix_sigma=0.3, fix_rate=10.0, real=RealEffects(slow_errors=slow,
-                                                                            stated_factor=0.5))
+    options = replace(PAPER, fix_sigma=0.3, fix_rate=10.0, real=RealEffects(
+        slow_errors=slow, stated_sigma_ratio=0.5))
     drive = simulate(options)
     want = 0.3**2 + 1.2**2 + 0.9**2
     assert_allclose(drive.fix.covariance_n[0], 0.25 * np.diag([want, want, 4 * want]), rtol=1e-12)

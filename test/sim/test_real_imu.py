@@ -53,7 +53,7 @@ def test_a_given_bias_is_used_and_follows_its_warm_up_curve():
 def test_bias_instability_starts_at_the_bias_and_is_a_markov_process():
     t = np.arange(0.0, 100.0, 0.05)
     ends = [real_sensors.drift_and_vibration(t, np.zeros(len(t)), replace(options(
-        gyro_wander=0.01, wander_time=200.0), seed=seed))[0] for seed in range(300)]
+        gyro_instability=0.01, instability_time=200.0), seed=seed))[0] for seed in range(300)]
     assert all((one[0] == 0).all() for one in ends)
     # variance of x(T) - x(0): 2 s^2 (1 - exp(-T / tau)); 900 draws, 5 sigma
     last = np.array([one[-1] for one in ends])

@@ -15,36 +15,47 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 
-GRADES = ('consumer', 'industrial', 'tactical')
+DRAWN_GRADES = ('consumer', 'industrial', 'tactical')
 # definition: units of data sheets in SI; G as rounded there, far within any distribution here
 G, MG, DEG, DEG_H, KMH = 9.81, 9.81e-3, math.radians(1.0), math.radians(1.0) / 3600, 1 / 3.6
 
-# by grade, as in GRADES: a sigma (normal distribution), a share of the vehicles or a fixed value;
-# of two numbers median and sigma of the logarithm, or as stated
-BY_GRADE: dict[str, tuple[Any, ...]] = {
-    'gyro scale': (0.01, 1.5e-3, 3e-4),                                # relative, sigma
+# the values of a quantity by grade, as in DRAWN_GRADES: sigma of a normal distribution, 1 sigma of
+# a process, or size with a random sign
+SIGMAS: dict[str, tuple[Any, ...]] = {
+    'gyro scale': (0.01, 1.5e-3, 3e-4),                                # relative
     'accelerometer scale': (0.01, 2e-3, 3e-4),
-    'misalignment': (0.4 * DEG, 0.05 * DEG, 3e-4),                     # rad, of axes, sigma
-    'triad rotation': (0.5 * DEG, 0.1 * DEG, 1e-3),       # rad, gyro to accelerometer, sigma
-    'g sensitivity': (0.05 * DEG / G, 0.008 * DEG / G, DEG_H / G),     # rad/s per m/s^2, sigma
-    'gyro bias': (DEG, 0.1 * DEG, 5 * DEG_H),                          # rad/s, sigma
-    'accelerometer bias': (25 * MG, 3 * MG, MG),                       # m/s^2, sigma
-    'gyro wander': (200 * DEG_H, 25 * DEG_H, 0.5 * DEG_H),             # rad/s, sigma
-    'accelerometer wander': (MG, 0.2 * MG, 0.05 * MG),                 # m/s^2, sigma
-    'rectification': (0.3e-3 / G, 0.06e-3 / G, 0.01e-3 / G),    # m/s^2 per (m/s^2)^2, size
-    'imu jitter': (3e-3, 1e-3, 1e-5),                                  # s, sigma
-    'nominal scale': (0.015, 0.025, 0.005),                            # relative, sigma
-    'rtk': (0.1, 0.4, 0.9),                                            # share of the vehicles
-    'lever arm error': (0.15, 0.03, 0.01),                             # m, each axis, sigma
-    'unmeasured lever arms': (0.3, 0.1, 0.0),                          # share of the vehicles
+    'misalignment': (0.4 * DEG, 0.05 * DEG, 3e-4),                     # rad, of axes
+    'triad rotation': (0.5 * DEG, 0.1 * DEG, 1e-3),                    # rad, gyro to accelerometer
+    'g sensitivity': (0.05 * DEG / G, 0.008 * DEG / G, DEG_H / G),     # rad/s per m/s^2
+    'gyro bias': (DEG, 0.1 * DEG, 5 * DEG_H),                          # rad/s
+    'accelerometer bias': (25 * MG, 3 * MG, MG),                       # m/s^2
+    'gyro instability': (200 * DEG_H, 25 * DEG_H, 0.5 * DEG_H),        # rad/s, of a process
+    'accelerometer instability': (MG, 0.2 * MG, 0.05 * MG),            # m/s^2, of a process
+    'rectification': (0.3e-3 / G, 0.06e-3 / G, 0.01e-3 / G),    # m/s^2 per (m/s^2)^2, random sign
+    'imu jitter': (3e-3, 1e-3, 1e-5),                                  # s
+    'nominal scale': (0.015, 0.025, 0.005),                            # relative
+    'lever arm error': (0.15, 0.03, 0.01),                             # m, each axis
+    'mounting': ((3.0, 3.0, 3.0), (1.5, 1.5, 2.0), (0.5, 0.5, 0.5)),   # deg: roll, pitch, yaw
+}
+# shares of the vehicles, or probabilities
+SHARES: dict[str, tuple[Any, ...]] = {
+    'rtk': (0.1, 0.4, 0.9),
+    'unmeasured lever arms': (0.3, 0.1, 0.0),
+    # of fine counts, coarse counts and a speed
+    'odometers': ((0.6, 0.3, 0.1), (0.1, 0.2, 0.7), (1.0, 0.0, 0.0)),
+}
+# median, and sigma of the logarithm
+LOGNORMALS: dict[str, tuple[Any, ...]] = {
     'gyro slope': ((0.02 * DEG, 0.7), (0.002 * DEG, 0.5), (0.5 * DEG_H, 0.5)),     # rad/s per K
     'accelerometer slope': ((0.5 * MG, 0.5), (0.05 * MG, 0.5), (0.02 * MG, 0.5)),  # m/s^2 per K
-    'temperature rise': ((5.0, 25.0), (3.0, 10.0), (3.0, 5.0)),        # K, range
-    'latency': ((0.010, 0.6), (0.005, 0.5), (0.002, 0.5)),             # s
-    'filter': ((0.002, 0.019), (0.002, 0.010), (0.001, 0.016)),        # s, range
-    'mounting': ((3.0, 3.0, 3.0), (1.5, 1.5, 2.0), (0.5, 0.5, 0.5)),   # deg, roll, pitch, yaw
-    'odometers': ((0.6, 0.3, 0.1), (0.1, 0.2, 0.7), (1.0, 0.0, 0.0)),  # fine, coarse, speed
+    'stamp latency': ((0.010, 0.6), (0.005, 0.5), (0.002, 0.5)),                   # s
 }
+# least and largest value of a uniform distribution
+RANGES: dict[str, tuple[Any, ...]] = {
+    'temperature rise': ((5.0, 25.0), (3.0, 10.0), (3.0, 5.0)),                    # K
+    'imu filter delay': ((0.002, 0.019), (0.002, 0.010), (0.001, 0.016)),          # s
+}
+BY_GRADE = SIGMAS | SHARES | LOGNORMALS | RANGES
 
 
 @dataclass(frozen=True)
@@ -65,11 +76,11 @@ class Vehicle:
     city: bool       # multipath, outages, worse covariances
     robot: bool      # small, slow, without springs
     options: dict[str, Any]    # fields of SimOptions, before any effect
-    effects_requested: bool    # by name: then each effect is present, not by chance
+    effects_requested: bool    # by the user, by name: each is then present, not by chance
 
     def grade_value(self, name: str) -> Any:
         """Return the entry of BY_GRADE for the vehicle's grade."""
-        return BY_GRADE[name][GRADES.index(self.grade)]
+        return BY_GRADE[name][DRAWN_GRADES.index(self.grade)]
 
     @property
     def speed_options(self) -> dict[str, Any]:
