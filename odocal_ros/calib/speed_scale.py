@@ -11,20 +11,23 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import robust_sigma
 
-# judgement: s, longest cell, in which the speed hardly varies, and shortest; intended number
-LONGEST_CELL, SHORTEST_CELL, WANTED_CELLS = 5.0, 2.0, 40
-SLOWEST_CELL = 0.2            # judgement: share of a high speed; below it fix errors dominate
-MIN_CELLS, BINS = 12, 10    # judgement: cells for a result; points of a figure
-MIN_SPREAD = 0.1    # judgement: of speeds over their mean; below it no offset is separable
-NO_BINS = np.empty((0, 4))    # definition
+LONGEST_CELL = 5.0      # s, judgement: the speed hardly varies in it
+SHORTEST_CELL = 2.0     # s, judgement
+WANTED_CELLS = 40       # judgement: intended number of cells of a leg
+SLOWEST_CELL = 0.2      # judgement: share of the 90th percentile of speed; below, fixes are noisy
+MIN_CELLS = 12          # judgement: for a result
+BINS = 10               # judgement: points of a figure
+MIN_SPEED_VARIATION = 0.1    # judgement: sigma of speeds over their mean; below it no offset shows
+NO_BINS = np.empty((0, 4))    # definition: ``SpeedScale.bins`` of a leg without a result
 
 
 @dataclass(frozen=True, eq=False)
 class SpeedScale:
     """
-    Scale by speed, with a fit: fixes = factor * odometer + offset * time, the odometer late.
+    Scale by speed, and a fit to the cells.
 
-    Each of the fit is (value, sigma), None if the speeds do not determine it.
+    Fit: distance of the fixes = factor * odometer travel + offset * time + lag * change of speed;
+    each value with its sigma, None if the speeds do not determine it.
     """
 
     bins: Floats  # (b, 4) speed m/s, ratio in m per unit, its sigma, number of cells
@@ -33,14 +36,15 @@ class SpeedScale:
     lag: tuple[float, float] | None = None  # s
 
 
-def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
+def speed_scale(t_fix: Floats, fix_n: Floats, reckoned_n: Floats, distance: Floats,
                 travel: Travel) -> SpeedScale:
     """
     Return the scale against speed of a leg.
 
-    t_fix : (k,) times of fixes, s, rising.   fix_n, dead_n : (k, 2 or more) positions by fixes and
-    by dead reckoning, m.   distance : (k,) path length by dead reckoning, m; over the chord by
-    ``dead_n`` it converts chords to path lengths.   travel : of the uncorrected odometer.
+    t_fix : (k,) times of fixes, s, rising.   fix_n, reckoned_n : (k, 2 or more) positions by fixes
+    and by dead reckoning, m.   distance : (k,) path length by dead reckoning, m; its ratio to the
+    chord of ``reckoned_n`` converts chords into path lengths.   travel : of the uncorrected
+    odometer.
     """
     if len(t_fix) < MIN_CELLS or len(travel.t) < MIN_CELLS:
         return SpeedScale(NO_BINS)
@@ -49,57 +53,60 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     knots = np.unique(np.searchsorted(t_fix[:-1], np.arange(t_fix[0], t_fix[-1], cell)))
     t = t_fix[knots]
     duration, path = np.diff(t), np.diff(distance[knots])
-    chord, dead = (np.hypot(*np.diff(p[knots, :2], axis=0).T) for p in (fix_n, dead_n))
-    rolled = np.diff(travel.at(t))
+    chord, reckoned = (np.hypot(*np.diff(p[knots, :2], axis=0).T) for p in (fix_n, reckoned_n))
+    odometer_travel = np.diff(travel.at(t))
     speed = travel.at(t + 0.5) - travel.at(t - 0.5)       # mean of 1 s about each knot
-    straight = dead > 0.8 * path      # judgement: in tighter turns a chord is too short
+    is_straight = reckoned > 0.8 * path      # judgement: in tighter turns a chord is too short
     fine = travel.at(t[:-1, None] + duration[:, None] * np.arange(0.0, 1.0, 0.1))
     step = np.diff(fine, axis=1)
     same_direction = (step > 0).all(axis=1) | (step < 0).all(axis=1)
-    usable = (2 * cell > duration) & straight & (rolled != 0) & same_direction
+    has_no_gap = 2 * cell > duration
+    usable = has_no_gap & is_straight & (odometer_travel != 0) & same_direction
     top_speed = float(np.percentile(path / duration, 90))      # robust to outliers
     usable &= path / duration > SLOWEST_CELL * top_speed
     if usable.sum() < MIN_CELLS:
         return SpeedScale(NO_BINS)
-    length, change = chord[usable] * path[usable] / dead[usable], np.diff(np.abs(speed))[usable]
-    rolled, duration = np.abs(rolled[usable]), duration[usable]
-    fit, used = _fit_cells(length, rolled, duration, change)
-    return SpeedScale(_bins(length[used], rolled[used], duration[used]), *fit)
+    length = chord[usable] * path[usable] / reckoned[usable]
+    speed_change = np.diff(np.abs(speed))[usable]
+    odometer_travel, duration = np.abs(odometer_travel[usable]), duration[usable]
+    fit, used = _fit_cells(length, odometer_travel, duration, speed_change)
+    return SpeedScale(_bins(length[used], odometer_travel[used], duration[used]), *fit)
 
 
-def _fit_cells(length: Floats, rolled: Floats, duration: Floats, change: Floats
+def _fit_cells(length: Floats, odometer_travel: Floats, duration: Floats, speed_change: Floats
                ) -> tuple[tuple[tuple[float, float], ...], Bools]:
     """
     Return factor, offset and lag of ``SpeedScale``, () if not determined, and mask of used cells.
 
-    length, rolled, duration, change : (k,) by the fixes, m, by the odometer, units, time, s, and
-    change of the odometer speed, units/s.
+    length, odometer_travel, duration, speed_change : (k,) by the fixes, m, by the odometer, units,
+    time, s, and change of the odometer speed, units/s.
     """
     used: Bools = np.ones(len(length), bool)
-    mean_speed, scale = length / duration, length.sum() / rolled.sum()
-    X = np.stack([rolled, duration, scale * change], -1)
+    mean_speed, scale = length / duration, length.sum() / odometer_travel.sum()
+    X = np.stack([odometer_travel, duration, scale * speed_change], -1)
     for _ in range(3):      # iterations of outlier rejection
         x, *_ = np.linalg.lstsq(X[used], length[used], rcond=None)
-        residual = np.abs(length - X @ x)
-        sigma = robust_sigma(residual[used])
-        used = np.asarray(residual <= 4 * max(sigma, 1e-6))     # statistical: one in 16,000
-    spread = float(np.std(mean_speed[used]) / np.mean(mean_speed[used]))
-    if used.sum() < MIN_CELLS or spread < MIN_SPREAD:
+        deviation = np.abs(length - X @ x)
+        sigma = robust_sigma(deviation[used])
+        used = np.asarray(deviation <= 4 * max(sigma, 1e-6))     # statistical: one in 16,000
+    variation = float(np.std(mean_speed[used]) / np.mean(mean_speed[used]))
+    if used.sum() < MIN_CELLS or variation < MIN_SPEED_VARIATION:
         return (), used
     variance = float(np.sum((length - X @ x)[used]**2)) / max(int(used.sum()) - 3, 1)
     sigmas = np.sqrt(np.diag(np.linalg.pinv(X[used].T @ X[used])) * variance)
     return tuple((float(value), float(s)) for value, s in zip(x, sigmas, strict=True)), used
 
 
-def _bins(length: Floats, rolled: Floats, duration: Floats) -> Floats:
+def _bins(length: Floats, odometer_travel: Floats, duration: Floats) -> Floats:
     """Return ``SpeedScale.bins`` of cells, each with the same number of cells: (b, 4)."""
     # sorted by odometer speed: by the fixes they would be sorted by fix errors
-    order, scale = np.argsort(rolled / duration, kind='stable'), float(length.sum() / rolled.sum())
+    order = np.argsort(odometer_travel / duration, kind='stable')
+    scale = float(length.sum() / odometer_travel.sum())
     rows = []
     for part in np.array_split(order, min(BINS, len(order) // 4)):
-        travel, n = rolled[part].sum(), len(part)
+        travel, n = odometer_travel[part].sum(), len(part)
         ratio = float(length[part].sum() / travel)
-        square = np.sum((length[part] - ratio * rolled[part])**2)
+        square = np.sum((length[part] - ratio * odometer_travel[part])**2)
         rows.append((scale * float(travel / duration[part].sum()), ratio,
                      float(np.sqrt(square * n / (n - 1)) / travel), n))
     return np.array(rows)
