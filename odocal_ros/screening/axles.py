@@ -22,7 +22,7 @@ from odocal_ros.screening.wheel_faults import (
     STALLED_SHARE,
     wheels_on_grid,
 )
-from odocal_ros.screening.wheel_travel import Wheels
+from odocal_ros.screening.wheel_travel import LegWheels
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 Wheel = TypeVar('Wheel')
@@ -40,8 +40,8 @@ def pair_wheels(wheels: Sequence[Wheel]) -> list[tuple[Wheel, ...]]:
     return [tuple(wheels[k:k + 2]) for k in range(0, len(wheels), 2)]
 
 
-def usable_axles(wheels: Wheels, imu: Imu,
-                 marks: tuple[float, float]) -> tuple[Wheels, list[Reason]]:
+def usable_axles(wheels: LegWheels, imu: Imu,
+                 marks: tuple[float, float]) -> tuple[LegWheels, list[Reason]]:
     """
     Return the usable wheels, with ``distance_ahead`` of steered ones, and reasons.
 

@@ -29,7 +29,7 @@ from odocal_ros.screening.leg_kind import with_assumed_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, reversing_reasons
 from odocal_ros.screening.rounded_fixes import rounding_variance
 from odocal_ros.screening.row_screen import topic_gap, usable_rows
-from odocal_ros.screening.wheel_travel import travel_of_wheels, Wheels
+from odocal_ros.screening.wheel_travel import LegWheels, travel_of_wheels
 from odocal_ros.settings.config import Config, SIDES
 
 # judgement: of an approximate track, an hour at 146 Hz; more only take memory. 2 h at 1 kHz are
@@ -117,7 +117,7 @@ def _missing(leg: Leg, reasons: list[Reason]) -> list[Reason]:
 
 
 def _usable_topics(leg: Leg, config: Config, check_faults: bool,
-                   ) -> tuple[dict[str, UsableRows], Wheels, list[Reason]]:
+                   ) -> tuple[dict[str, UsableRows], LegWheels, list[Reason]]:
     """Return the usable rows of IMU, fixes and external sensors, the wheels, and reasons."""
     offset = clocks.stamp_offsets(config)
 
@@ -169,7 +169,7 @@ def _fix_fields(leg: Leg, config: Config,
             'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}, reasons
 
 
-def _travel_fields(leg: Leg, wheels: Wheels) -> dict[str, Any]:
+def _travel_fields(leg: Leg, wheels: LegWheels) -> dict[str, Any]:
     """Return the travel of the wheels as fields of Inputs."""
     # of two wheels with unknown sides only the mean is defined
     several = wheels.wheels if leg.form.sides_known and len(wheels.wheels) > 1 else ()

@@ -6,7 +6,7 @@ Travel of one or more wheels: each counter corrected separately, then their mean
 
 Wheel counters can roll over below the range of their message type, each differently: one driver
 uses 64 bits, the other 16 in a message of 64. Such rollovers are jumps opposite to the travel, all
-of the same size: the span.
+of the same size: the modulus.
 """
 
 from collections.abc import Callable
@@ -27,91 +27,104 @@ from odocal_ros.screening.inputs import UsableRows
 from odocal_ros.screening.late_rows import sampling_times
 from odocal_ros.settings.config import Config
 
-# known spans of integer counts, and of angles in rad or deg
-SPANS = {'integer': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
-NAMED_SPANS = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
+# known moduli of integer counts, and of angles in rad or deg
+KNOWN_MODULI = {'integer': 2.0 ** np.arange(6, 54),
+                'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
+NAMED_MODULI = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
 
 
 @dataclass(frozen=True, eq=False)
-class RolloverSpan:
-    """Rollovers of a counter: its span in counts, its sigma, and the rows before them."""
+class Rollovers:
+    """Rollovers of a counter: its modulus, and the rows before them."""
 
-    size: float
-    sigma: float                 # 0: certain
+    modulus: float               # units of the values
+    sigma: float                 # of the modulus; 0: certain
     rows: NDArray[np.int64]      # (k,)
-    turns: NDArray[np.int64]     # (k,) +1 rolled over upwards, -1 downwards
+    direction: NDArray[np.int64]    # (k,) +1 rolled over upwards, -1 downwards
 
 
-def hidden_span(value: Values, step: Floats) -> RolloverSpan | None:
+def find_rollovers(value: Values, step: Floats) -> Rollovers | None:
     """Return the rollovers of a counter by values, (n,), and steps, (n - 1,); None without any."""
-    # they are jumps against the travel, relative to the usual step, a running median
     if len(step) < MIN_STEPS or not step.any():
         return None
+    is_integer = np.issubdtype(value.dtype, np.integer)
+    usual = _usual_steps(step)
+    rows = _jump_rows(step, usual, is_integer)
+    if not len(rows):
+        return None
+    size = np.abs(step - usual)[rows]
+    tolerance = np.abs(usual[rows]) / 2 + (3.0 if is_integer else 1e-3 * size)
+    estimate = _estimate_modulus(value, rows, float(np.median(size)), float(np.median(tolerance)))
+    if estimate is None:
+        return None
+    modulus, sigma = estimate
+    agrees = np.abs(size - modulus) <= 2 * tolerance
+    min_agreeing = 0.8    # share of the jumps
+    if agrees.mean() < min_agreeing:
+        return None
+    rows = rows[agrees]
+    # a larger range: likely rows out of order, or two counters
+    if _value_range(value, rows) > modulus + np.median(tolerance):
+        return None
+    return Rollovers(modulus, sigma, rows, -np.sign((step - usual)[rows]).astype(np.int64))
+
+
+def _usual_steps(step: Floats) -> Floats:
+    """Return the running median of steps: (n,)."""
     side_steps = 7    # on each side of a step, in its running median
     padded = np.pad(step, side_steps, mode='edge')
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * side_steps + 1),
-                      axis=-1)
-    is_integer = np.issubdtype(value.dtype, np.integer)
+    return np.asarray(np.median(
+        np.lib.stride_tricks.sliding_window_view(padded, 2 * side_steps + 1), axis=-1))
+
+
+def _jump_rows(step: Floats, usual: Floats, is_integer: bool) -> Ints:
+    """Return the rows before jumps against the travel, relative to the usual step: (k,)."""
     jump = step - usual
     largest_usual = float(np.percentile(np.abs(usual), 99.9))
     min_jump = 8.0    # counts
     is_large = np.abs(jump) > np.maximum(2 * np.abs(usual) + min_jump * is_integer,
                                          1.5 * largest_usual)
     # only against the travel: a frozen counter catches up with a jump along it
-    rows = np.flatnonzero(is_large & (jump * usual <= 0))
-    if not len(rows):
-        return None
-    size = np.abs(jump[rows])
-    tolerance = np.abs(usual[rows]) / 2 + (3.0 if is_integer else 1e-3 * size)
-    span, sigma = _estimate_span(value, rows, float(np.median(size)),
-                                 float(np.median(tolerance)))
-    agrees = np.abs(size - span) <= 2 * tolerance
-    min_agreeing = 0.8    # share of the jumps; none agrees with NaN
-    if agrees.mean() < min_agreeing:
-        return None
-    rows = rows[agrees]
-    if _value_range(value, rows) > span + np.median(tolerance):   # rows out of order, two counters
-        return None
-    return RolloverSpan(span, sigma, rows, -np.sign(jump[rows]).astype(np.int64))
+    return np.flatnonzero(is_large & (jump * usual <= 0))
 
 
-def _estimate_span(value: Values, rows: Ints, size: float,
-                   tolerance: float) -> tuple[float, float]:
+def _estimate_modulus(value: Values, rows: Ints, size: float,
+                      tolerance: float) -> tuple[float, float] | None:
     """
-    Return the span of a counter and its sigma, 0 if certain; (NaN, 0) if it has none.
+    Return the modulus of a counter and its sigma, 0 if certain; None if it has none.
 
     rows : (k,) rows before the jumps.   size, tolerance : median size of the jumps, and its error.
     """
     is_integer = np.issubdtype(value.dtype, np.integer)
-    spans = SPANS['integer' if is_integer else 'angle']
-    known = float(spans[np.argmin(np.abs(spans - size))])
-    # judgement, of the span: largest deviation of a single jump from a known span
+    moduli = KNOWN_MODULI['integer' if is_integer else 'angle']
+    known = float(moduli[np.argmin(np.abs(moduli - size))])
+    # judgement, of the modulus: largest deviation of a single jump from a known one
     single_limit = np.inf if len(rows) > 1 else 0.01 * known
     if abs(known - size) <= min(tolerance, single_limit):
         return known, 0.0
-    min_jumps = 3    # for a span that is not a known one
+    min_jumps = 3    # for a modulus that is not a known one
     if len(rows) < min_jumps:
-        return np.nan, 0.0
+        return None
     if not is_integer:
         return size, tolerance / np.sqrt(3 * len(rows))
-    span, sigma = _roundest_span(value, rows, size, tolerance)
-    return (span, sigma) if span <= spans[-1] else (np.nan, 0.0)    # wider: values are damaged
+    modulus, sigma = _roundest_modulus(value, rows, size, tolerance)
+    return (modulus, sigma) if modulus <= moduli[-1] else None    # wider: values are damaged
 
 
 def _value_range(value: Values, rows: Ints) -> float:
-    """Return the range of the values before and after jumps, which is less than the span."""
+    """Return the range of the values before and after jumps, which is less than the modulus."""
     return float(np.ptp(np.stack([value[rows], value[rows + 1]]).astype(float)))
 
 
-def _roundest_span(value: Values, rows: Ints, size: float,
-                   tolerance: float) -> tuple[float, float]:
-    """Return the roundest number that can be the span, and its sigma; see ``_estimate_span``."""
+def _roundest_modulus(value: Values, rows: Ints, size: float,
+                      tolerance: float) -> tuple[float, float]:
+    """Return the roundest possible modulus, and its sigma; as ``_estimate_modulus``."""
     low = _value_range(value, rows) + 1
     high = max(low, size + 2 * tolerance / np.sqrt(len(rows)))
     for unit in (1e6, 1e5, 1e4, 1e3, 1e2):
-        span = np.ceil(low / unit) * unit
-        if span <= high:
-            return float(span), 0.0
+        modulus = np.ceil(low / unit) * unit
+        if modulus <= high:
+            return float(modulus), 0.0
     return float(round((low + high) / 2)), max(1.0, (high - low) / np.sqrt(12))
 
 
@@ -119,43 +132,50 @@ def correct_rollovers(
         t: Floats, samples: OdometerSamples, step: Floats, name: str, *, only_counter: bool = True,
         ) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
     """
-    Return rows with hidden rollovers corrected, reasons, times and sigmas of uncertain travel.
+    Return rows with rollovers corrected, reasons, times and sigmas of uncertain travel.
 
     t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its steps, rollovers
     of the message type's range corrected.   name : of the counter, in reasons.   only_counter :
     the vehicle has no other one. Times are (k,) s, sigmas (k,) counts.
     """
-    span = hidden_span(samples.value, step)
+    found = find_rollovers(samples.value, step)
     none = np.empty(0)
-    if span is None:
+    if found is None:
         return samples, (), none, none
-    turns = np.zeros(len(t), np.int64)
-    turns[span.rows + 1] = span.turns
-    size = round(span.size) if np.issubdtype(samples.value.dtype, np.integer) else span.size
-    value: NDArray[Any] = samples.value + size * np.cumsum(turns)
-    times = len(span.rows)
-    about = f'about {span.size:.0f} (± {span.sigma:.0f})' if span.sigma else NAMED_SPANS.get(
-        span.size, f'{span.size:.0f}')
-    angle = span.size in NAMED_SPANS     # exact, but odometer.wrap needs an integer
+    direction = np.zeros(len(t), np.int64)
+    direction[found.rows + 1] = found.direction
+    is_integer = np.issubdtype(samples.value.dtype, np.integer)
+    modulus = round(found.modulus) if is_integer else found.modulus
+    value: NDArray[Any] = samples.value + modulus * np.cumsum(direction)
+    # one error of the modulus for all jumps; the budget treats uncertainties as independent
+    uncertain_sigma = np.full(len(found.rows), found.sigma * np.sqrt(len(found.rows)))
+    return (replace(samples, value=value), (_rollover_reason(found, t, name, only_counter),),
+            *((t[found.rows], uncertain_sigma) if found.sigma else (none, none)))
+
+
+def _rollover_reason(found: Rollovers, t: Floats, name: str, only_counter: bool) -> Reason:
+    """Return the reason that reports rollovers; arguments as for ``correct_rollovers``."""
+    times, modulus = len(found.rows), f'{found.modulus:.0f}'
+    about = f'about {modulus} (± {found.sigma:.0f})' if found.sigma else NAMED_MODULI.get(
+        found.modulus, modulus)
+    angle = found.modulus in NAMED_MODULI     # exact, but odometer.wrap needs an integer
     code = Code.COUNTER_ROLLOVER if only_counter or angle else Code.WHEEL_COUNTERS_DIFFER
-    remedy = '' if angle else f'Set odometer.wrap to {span.size:.0f}.' if only_counter else (
-        f'If both wheels have this modulus, set odometer.wrap to {span.size:.0f}. Otherwise '
+    remedy = '' if angle else f'Set odometer.wrap to {modulus}.' if only_counter else (
+        f'If both wheels have this modulus, set odometer.wrap to {modulus}. Otherwise '
         'correct the driver: odometer.wrap is for both.')
     # judgement: few counters roll over so often; values of two counters alternate
-    two_publishers = times > 0.1 * len(step)
-    reason = Reason(code, f'{name} rolls over at {about}, below the range of its message type; '
-                    f'{times} jump{"s" * (times > 1)} of this size opposite to the travel, '
-                    f'first at t = {t[span.rows[0] + 1]:.2f} s, removed from the travel'
-                    + '. Check for two publishers on the topic if the counter cannot roll over so '
-                    'often' * two_publishers, remedy)
-    # one error of the span for all jumps; the budget treats uncertainties as independent
-    uncertain_sigma = np.full(times, span.sigma * np.sqrt(times))
-    return (replace(samples, value=value), (reason,),
-            *((t[span.rows], uncertain_sigma) if span.sigma else (none, none)))
+    two_publishers = times > 0.1 * (len(t) - 1)
+    text = (f'{name} rolls over at {about}, below the range of its message type; {times} '
+            f'jump{"s" * (times > 1)} of this size opposite to the travel, first at t = '
+            f'{t[found.rows[0] + 1]:.2f} s, removed from the travel')
+    if two_publishers:
+        text += ('. Check for two publishers on the topic if the counter cannot roll over so '
+                 'often')
+    return Reason(code, text, remedy)
 
 
 @dataclass(frozen=True, eq=False)
-class Wheels:
+class LegWheels:
     """Travel of the wheels, and its uncertain parts."""
 
     wheels: tuple[Travel, ...]
@@ -187,7 +207,7 @@ class Wheels:
 
 def travel_of_wheels(leg: Leg, config: Config,
                      usable_rows: Callable[[str], tuple[UsableRows, list[Reason]]],
-                     ) -> tuple[Wheels, list[Reason]]:
+                     ) -> tuple[LegWheels, list[Reason]]:
     """
     Return the travel of the wheels of a leg, and reasons.
 
@@ -204,21 +224,21 @@ def travel_of_wheels(leg: Leg, config: Config,
                 f'{names[0]} wheel {_form_text(leg.form)}: they cannot be averaged, so only the '
                 f'{names[0]} wheel is used', 'Publish both wheels as one kind of value. If only '
                 'the modulus differs, set odometer.wrap.'))
-            return Wheels(tuple(wheels[:1]), uncertain), reasons
+            return LegWheels(tuple(wheels[:1]), uncertain), reasons
         (samples, t), row_reasons = usable_rows(slot)
         reasons += row_reasons
         if wheels and not len(t):
             reasons.append(Reason(
                 Code.WHEEL_DEAD, f'the {name} wheel has no usable value between the marks: only '
                 f'the {names[0]} wheel is used'))
-            return Wheels(tuple(wheels[:1]), uncertain), reasons
+            return LegWheels(tuple(wheels[:1]), uncertain), reasons
         if len(slots) == 1 and len(config.odometer.wheel_keys) > 1 and len(t):
             reasons.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
                                   'marks: only the left wheel is used'))
         wheel, uncertain[name], wheel_reasons = _corrected_travel(samples, t, form, config, name)
         wheels.append(wheel)
         reasons += wheel_reasons
-    return Wheels(tuple(wheels), uncertain), reasons
+    return LegWheels(tuple(wheels), uncertain), reasons
 
 
 def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
