@@ -31,6 +31,10 @@ from odocal_ros.settings.config import WheelsConfig
 NAMES = ('left', 'right', 'heading')
 # definition: columns mean, difference (right minus left), heading
 FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
+# definition: a polynomial without factors for each field whose size is a power of a prime:
+# coefficients, the lowest power first, that of the highest is 1
+MODULI = {4: (1, 1), 8: (1, 0, 1), 9: (1, 0), 16: (1, 0, 0, 1), 25: (1, 1), 27: (1, 0, 2),
+          49: (1, 0)}
 
 
 def prime_power(q: int) -> tuple[int, int] | None:
@@ -60,8 +64,9 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
     An element is the number whose digits to base p are the coefficients of a polynomial.
     """
     power = prime_power(q)
-    if power is None:
-        raise BadUsage(f'{q} levels: no finite field has this many elements; give a prime power')
+    if power is None or power[1] > 1 and q not in MODULI:
+        raise BadUsage(f'{q} levels: there is no array; give a prime, or one of '
+                       f'{", ".join(map(str, MODULI))}')
     p, m = power
     digits = np.array([[k // p**i % p for i in range(m)] for k in range(q)])
     weight = p**np.arange(m)
@@ -70,31 +75,9 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
     products = np.zeros((q, q, 2 * m - 1), np.int64)
     for i, j in product(range(m), repeat=2):
         products[..., i + j] += np.multiply.outer(digits[:, i], digits[:, j])
-    modulus = irreducible(p, m)
     for k in range(2 * m - 2, m - 1, -1):      # x^k = -x^(k-m) * (modulus - x^m)
-        products[..., k - m:k] -= products[..., k, None] * np.array(modulus[:m], np.int64)
+        products[..., k - m:k] -= products[..., k, None] * np.array(MODULI[q], np.int64)
     return add, (products[..., :m] % p) @ weight
-
-
-def irreducible(p: int, m: int) -> tuple[int, ...]:
-    """Return the first monic polynomial of degree m over 0..p-1 that has no factor."""
-    # a polynomial is the tuple of its coefficients, that of the lowest power first
-    factors = [(*low, 1) for d in range(1, m // 2 + 1) for low in product(range(p), repeat=d)]
-    for low in product(range(p), repeat=m):
-        candidate = (*low, 1)
-        if not any(_divides(f, candidate, p) for f in factors):
-            return candidate
-    raise AssertionError('a field of every prime power exists')
-
-
-def _divides(factor: tuple[int, ...], polynomial: tuple[int, ...], p: int) -> bool:
-    """Return True if a monic factor divides a polynomial over 0..p-1, by long division."""
-    remainder, degree = list(polynomial), len(factor) - 1
-    for k in range(len(remainder) - 1, degree - 1, -1):
-        quotient = remainder[k]
-        for i, coefficient in enumerate(factor):
-            remainder[k - degree + i] = (remainder[k - degree + i] - quotient * coefficient) % p
-    return not any(remainder[:degree])
 
 
 def bose(q: int, columns: int) -> Ints:
