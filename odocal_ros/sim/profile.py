@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
 
 from odocal_ros.data.arrays import Floats, Ints
@@ -56,7 +57,7 @@ class Profile:
         """Return the integral from the first break."""
         order = np.arange(1, self.powers.shape[1] + 1)
         powers = np.concatenate([np.zeros((len(self.powers), 1)), self.powers / order], axis=1)
-        powers[1:, 0] = np.cumsum(_horner(powers.T, np.diff(self.breaks)))[:-1]
+        powers[1:, 0] = np.cumsum(polyval(np.diff(self.breaks), powers.T, False))[:-1]
         return Profile(self.breaks, powers)
 
     def _piece(self, t: ArrayLike) -> Ints:
@@ -65,15 +66,7 @@ class Profile:
 
     def _evaluate(self, piece: Ints, t: ArrayLike) -> Floats:
         t = np.clip(t, self.breaks[0], self.breaks[-1])
-        return _horner(self.powers.T[:, piece], t - self.breaks[piece])
-
-
-def _horner(powers: Floats, x: Floats) -> Floats:
-    """Return polynomials at x, coefficients in order of rising powers: (d, ...)."""
-    value: Floats = powers[-1]
-    for power in powers[-2::-1]:
-        value = value * x + power
-    return value
+        return np.asarray(polyval(t - self.breaks[piece], self.powers.T[:, piece], False))
 
 
 def line(duration: float, start: float, end: float) -> Piece:
