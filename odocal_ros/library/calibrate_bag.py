@@ -3,10 +3,10 @@
 
 """One calibration from one or several bags of a vehicle: ``odocal replay`` as a function."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadTopics, BadUsage, OdocalError
@@ -53,11 +53,13 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     notes = arguments.Notes(listener or arguments.Listener())
     request = _Request(arguments.topics_of(topics), config, arguments.legs_of(legs), holdout)
     imu = known_imu(arguments.config_of(config))
-    paths, repeated = unique_paths(arguments.paths_of(path))
-    for duplicate in repeated:
-        notes.note(f'{duplicate} is given twice; it is read once')
+    unique: dict[Path, Path] = {}
+    for given in arguments.paths_of(path):
+        if unique.setdefault(given.resolve(), given) is not given:
+            notes.note(f'{given} is given twice; it is read once')
+    paths = list(unique.values())
     if len(paths) > 1:
-        check_all_bags(paths, lambda bag: _check_bag(bag, request))
+        _check_bags(paths, request)
     bags = _calibrate_bags(paths, request, notes)
     settings = bags[-1].config
     first, *others = [flat(bag.config) for bag in bags]      # each journal has settings
@@ -73,8 +75,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     return Calibration(result, settings, tuple(inputs), tuple(notes.texts))
 
 
-@dataclass(frozen=True)
-class _Request:
+class _Request(NamedTuple):
     """The arguments of ``calibrate_bag``, checked."""
 
     topics: dict[str, str]
@@ -83,17 +84,24 @@ class _Request:
     holdout: bool
 
 
-def _check_bag(path: Path, request: _Request) -> None:
-    """Open a bag and check that it has the required data."""
+def _check_bags(paths: list[Path], request: _Request) -> None:
+    """Check each bag for the required data; raise one BadUsage that names all errors."""
     from odocal_ros.bagio.read import open_bag
-    journal = journal_notes(path)
-    settings = arguments.config_of(request.config, journal.settings if journal else None)
-    with open_bag(path) as bag:
-        readers_of(bag, request.topics, settings, journal)
+    errors = []
+    for path in paths:
+        try:
+            journal = journal_notes(path)
+            settings = arguments.config_of(request.config, journal.settings if journal else None)
+            with open_bag(path) as bag:
+                readers_of(bag, request.topics, settings, journal)
+        except OdocalError as error:
+            errors.append(error_about(path, error))
+    if errors:
+        raise BadUsage(f'{len(errors)} of {len(paths)} bags cannot be used; nothing was '
+                       f'calibrated: {"; ".join(errors)}')
 
 
-@dataclass(frozen=True, eq=False)
-class _BagLegs:
+class _BagLegs(NamedTuple):
     """The results of a bag's legs, without the samples, which need much memory."""
 
     path: Path
@@ -192,17 +200,6 @@ def _usable_automatic_legs(results: list[LegResult],
     return usable
 
 
-def unique_paths(paths: list[Path]) -> tuple[list[Path], list[Path]]:
-    """Return the bags without duplicates, and the duplicates."""
-    first: dict[Path, Path] = {}
-    repeated = []
-    for path in paths:
-        if path.resolve() in first:
-            repeated.append(path)
-        first.setdefault(path.resolve(), path)
-    return list(first.values()), repeated
-
-
 def error_about(path: Path, error: Exception) -> str:
     """Return the error of one of several bags, starting with the bag."""
     text = ' '.join(str(error).split()) if isinstance(error, BadTopics) else str(error)
@@ -211,19 +208,6 @@ def error_about(path: Path, error: Exception) -> str:
     for name in (path.name, path.stem):      # some texts begin with the bag's name
         text = text.removeprefix(f'{name}: ')
     return f'{path}: {text}'
-
-
-def check_all_bags(paths: list[Path], check: Callable[[Path], object]) -> None:
-    """Check each bag before the work; raise one BadUsage that names all errors."""
-    errors = []
-    for path in paths:
-        try:
-            check(path)
-        except OdocalError as error:
-            errors.append(error_about(path, error))
-    if errors:
-        raise BadUsage(f'{len(errors)} of {len(paths)} bags cannot be used; nothing was '
-                       f'calibrated: {"; ".join(errors)}')
 
 
 def unique_names(paths: list[Path], legs: list[list[LegResult]],

@@ -62,9 +62,7 @@ class Calibration:
 
     def _estimates(self) -> dict[str, Estimate]:
         """Return the estimates by name; scale, yaw and pitch exist even if no leg was fitted."""
-        from odocal_ros.output.files import ALWAYS
-        estimates = {name: Estimate(None, None, unit or '') for name, unit in ALWAYS.items()}
-        return estimates | self.result.estimates
+        return result.unknown_values('') | self.result.estimates
 
     def __str__(self) -> str:
         """Return the result as one screen of text, as ``odocal replay`` prints it."""

@@ -4,11 +4,10 @@
 """Time series of a calibration as files of other programs: evo, tables, maps, PlotJuggler."""
 
 from collections.abc import Callable, Iterable
-from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 import tempfile
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -22,9 +21,10 @@ from odocal_ros.library.calibration import TABLES_INSTALL
 from odocal_ros.output.plot_style import PICTURES
 from odocal_ros.safe_io.atomic_files import whole_file
 
-RERUN_INSTALL = 'pip install rerun-sdk'
+# package and error text by the ending of files that need it
+REQUIRED = {'.parquet': ('pyarrow', f'Parquet needs pyarrow: {TABLES_INSTALL}'),
+            '.rrd': ('rerun', 'a recording of Rerun needs rerun-sdk: pip install rerun-sdk')}
 UNIT_NAMES = {'m': 'm', 'rad/s': 'rad_per_s', 'm/s^2': 'm_per_s2'}     # in names of joints
-KML = 'http://www.opengis.net/kml/2.2'
 
 
 def write_rrd(result: Calibration, path: Path) -> None:
@@ -82,22 +82,20 @@ def csv_text(columns: series.Series) -> str:
 
 def kml_text(columns: series.Series) -> str:
     """Return the track of each leg as a line on the ground, for Google Earth."""
-    ElementTree.register_namespace('', KML)
     if np.isnan(columns['latitude_deg']).all():
         raise BadUsage(f'export: track.kml: {export_pictures.NOT_ON_A_MAP}')
-    root = ElementTree.Element(f'{{{KML}}}kml')
-    document = ElementTree.SubElement(root, f'{{{KML}}}Document')
+    placemarks = ''
     for leg in np.unique(columns['leg']).tolist():
         rows = columns['leg'] == leg
-        placemark = ElementTree.SubElement(document, f'{{{KML}}}Placemark')
-        ElementTree.SubElement(placemark, f'{{{KML}}}name').text = f'leg {leg}'
-        line = ElementTree.SubElement(placemark, f'{{{KML}}}LineString')
-        ElementTree.SubElement(line, f'{{{KML}}}tessellate').text = '1'
-        ElementTree.SubElement(line, f'{{{KML}}}coordinates').text = ' '.join(
+        coordinates = ' '.join(
             f'{longitude:.8f},{latitude:.8f},{height:.3f}' for longitude, latitude, height in zip(
                 *(columns[name][rows] for name in ('longitude_deg', 'latitude_deg', 'height_m')),
                 strict=True))
-    return ElementTree.tostring(root, 'unicode', xml_declaration=True) + '\n'
+        placemarks += (f'<Placemark><name>leg {leg}</name><LineString><tessellate>1</tessellate>'
+                       f'<coordinates>{coordinates}</coordinates></LineString></Placemark>')
+    return ("<?xml version='1.0' encoding='UTF-8'?>\n"
+            f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{placemarks}</Document>'
+            '</kml>\n')
 
 
 def write_parquet(columns: series.Series, path: Path) -> None:
@@ -171,14 +169,6 @@ def _by_time(columns: series.Series) -> series.Series:
     return {name: column[order] for name, column in columns.items()}
 
 
-def _is_importable(module: str) -> bool:
-    try:
-        import_module(module)
-    except ImportError:
-        return False
-    return True
-
-
 SERIES: dict[str, Callable[[Calibration], series.Series]] = {
     'trajectory': series.trajectory, 'track': series.trajectory, 'states': series.states,
     'residuals': series.residuals, 'scale_by_speed': export_pictures.scale_by_speed}
@@ -192,14 +182,12 @@ KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
 
 def check_names(files: Iterable[Path | str]) -> None:
     """Raise BadUsage for a file with an unknown name, or without a library to write it."""
-    for file in files:
-        if Path(file).suffix == '.parquet' and not _is_importable('pyarrow'):
-            raise BadUsage(f'export: {file}: Parquet needs pyarrow: {TABLES_INSTALL}')
-        if Path(file).suffix == '.rrd' and not _is_importable('rerun'):
-            raise BadUsage(f'export: {file}: a recording of Rerun needs rerun-sdk: '
-                           f'{RERUN_INSTALL}')
-        if Path(file).name not in KNOWN:
-            raise BadUsage(f'export: {file}: {unknown_name(Path(file).name, KNOWN)}')
+    for file in map(Path, files):
+        package, text = REQUIRED.get(file.suffix, ('', ''))
+        if package and find_spec(package) is None:
+            raise BadUsage(f'export: {file}: {text}')
+        if file.name not in KNOWN:
+            raise BadUsage(f'export: {file}: {unknown_name(file.name, KNOWN)}')
 
 
 def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:

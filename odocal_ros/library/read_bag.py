@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from odocal_ros.bagio.read import Bag, bag_sha256, open_bag, TopicInfo
+from odocal_ros.bagio.read import Bag, bag_sha256, open_bag
 from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg, LegRecorder, SLOTS
@@ -49,11 +49,6 @@ class JournalNotes:
     path: Path
     settings: dict[str, object] = field(default_factory=dict)
     topics: dict[str, str] = field(default_factory=dict)
-
-    def topics_in(self, bag_topics: dict[str, TopicInfo]) -> dict[str, str]:
-        """Return slot -> topic of those that have messages in the bag."""
-        return {slot: topic for slot, topic in self.topics.items()
-                if topic in bag_topics and bag_topics[topic].count}
 
 
 def journal_notes(bag: Path) -> JournalNotes | None:
@@ -114,7 +109,9 @@ def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
                ) -> tuple[dict[str, str], dict[str, Reader]]:
     """Return slot -> topic, and topic -> reader; ``topics`` take precedence over a journal's."""
     from odocal_ros.library.topics import choose_topics, local_reference
-    requested = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
+    with_messages = {name for name, info in bag.topics.items() if info.count}
+    requested = {slot: topic for slot, topic in (journal.topics if journal else {}).items()
+                 if topic in with_messages} | dict(topics)
     mapping = choose_topics(bag.topics, config, requested, bool(floor_marks_of(config, bag)))
     note = local_reference(bag.topics, mapping, requested)
     if note and listener:
@@ -130,9 +127,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
     Read a bag: a rosbag2 folder (sqlite3, mcap), a rosbag1 file, or a file of either.
 
     path : of the bag, or of a journal of the node, which contains settings and topics.
-    topics : slot (imu, odometer, odometer_right, fix, fix_velocity, heading) -> topic; the others
-    are found by their type.   config : Config, settings by dotted name, or a parameter file.
-    listener : receives notes and progress.
+    topics, config, listener : as ``calibrate_bag``.
 
     Raises BadBag, BadData, BadUsage, BadConfig: the bag cannot be read, or an input is missing or
     ambiguous.

@@ -8,7 +8,7 @@ In: a calibration and its settings. The folder is replaced as a whole, so that i
 together; the report is drawn last, since it takes longest.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 import json
@@ -19,23 +19,20 @@ from typing import Any
 import numpy as np
 
 from odocal_ros import __version__
-from odocal_ros.calib.result import Calibration, LegResult, MethodResult, TrackCheck
+from odocal_ros.calib import result
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import program_files
 from odocal_ros.output.report import NAME as REPORT, report_or_error_page
-from odocal_ros.output.tables import pooled_check, pooled_per_distance
+from odocal_ros.output.tables import CHECKS, pooled_check, pooled_per_distance
 from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.safe_io.atomic_files import ResultFolder
 from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1    # format: version of calibration.json
 MAIN = 'calibration.json'
-# values in every result, also undetermined ones, and units; that of a scale depends on the data
-ALWAYS = {'scale_factor': None, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
-          'pitch_mounting_angle': 'rad'}
 
 
-def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
+def as_json(calibration: result.Calibration, config: Config, inputs: list[dict[str, Any]],
             created: str) -> dict[str, Any]:
     """
     Return the content of calibration.json.
@@ -45,16 +42,15 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
 
     Returns plain dicts and lists, no NaN: a missing number is None.
     """
-    result: dict[str, Any] = {name: {'value': None, 'sigma': None, 'unit': unit, 'method': None}
-                              for name, unit in ALWAYS.items()}
-    result |= {name: e.as_dict() | {'method': e.method or None}
-               for name, e in calibration.estimates.items()}
-    main_method = calibration.methods.get(result['scale_factor']['method'])
-    result |= main_method.details.get('beside', {}) if main_method else {}
-    result['imu_rotation'] = {'quaternion_xyzw': calibration.imu_rotation_xyzw,
+    values: dict[str, Any] = {
+        name: e.as_dict() | {'unit': e.unit or None, 'method': e.method or None}
+        for name, e in (result.unknown_values('') | calibration.estimates).items()}
+    main_method = calibration.methods.get(values['scale_factor']['method'])
+    values |= main_method.details.get('beside', {}) if main_method else {}
+    values['imu_rotation'] = {'quaternion_xyzw': calibration.imu_rotation_xyzw,
                               'rpy': calibration.imu_rotation_rpy}
-    checks = {name: pooled_check([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
-              for name in ('before', 'after')}
+    before, after = (pooled_check([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
+                     for name in CHECKS)
     optional: dict[str, Any] = {}
     if (acceptance := accept(calibration, config)) is not None:
         optional['acceptance'] = acceptance.as_dict()
@@ -70,17 +66,16 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
         'vehicle': config.vehicle,
         'verdict': calibration.verdict.value,
         'reasons': [r.as_dict() for r in calibration.reasons],
-        'result': result,
+        'result': values,
         'methods': {name: _method(m) for name, m in calibration.methods.items()},
         'legs': [_leg(leg) for leg in calibration.legs],
-        'check': {name: _check(check) for name, check in checks.items()} | {
-            'per_distance': _per_distance(calibration.legs)},
+        'check': _check(before, after, calibration.legs),
         'inputs': inputs,
         'config': flat(config)} | optional)
     return content
 
 
-def _method(method: MethodResult) -> dict[str, Any]:
+def _method(method: result.MethodResult) -> dict[str, Any]:
     """Return the entry of a method; arrays among its details are left out."""
     details = {key: detail for key, detail in method.details.items()
                if not isinstance(detail, np.ndarray)}
@@ -91,11 +86,7 @@ def _method(method: MethodResult) -> dict[str, Any]:
             'correlation': {}, 'budget': {}} | details
 
 
-def _check(check: TrackCheck | None) -> dict[str, Any] | None:
-    return None if check is None else asdict(check)
-
-
-def _leg(leg: LegResult) -> dict[str, Any]:
+def _leg(leg: result.LegResult) -> dict[str, Any]:
     """Return the entry of a leg."""
     return {'bag': leg.bag, 'start': leg.start_ns * 1e-9, 'stop': leg.stop_ns * 1e-9,
             'start_ns': leg.start_ns, 'stop_ns': leg.stop_ns,
@@ -103,13 +94,15 @@ def _leg(leg: LegResult) -> dict[str, Any]:
             'pulses': leg.pulses, 'fixes': leg.fixes, 'rejected_fixes': leg.rejected_fixes,
             'verdict': leg.verdict.value, 'reasons': [r.as_dict() for r in leg.reasons],
             'methods': {name: _method(m) for name, m in leg.methods.items()},
-            'check': {'before': _check(leg.before), 'after': _check(leg.after),
-                      'per_distance': _per_distance([leg])}}
+            'check': _check(leg.before, leg.after, [leg])}
 
 
-def _per_distance(legs: list[LegResult] | tuple[LegResult, ...]) -> list[dict[str, Any]]:
-    return [{'length': error.length, 'before': error.before, 'after': error.after}
-            for error in pooled_per_distance(legs)]
+def _check(before: result.TrackCheck | None, after: result.TrackCheck | None,
+           legs: Sequence[result.LegResult]) -> dict[str, Any]:
+    """Return the errors of dead reckoning before and after the calibration, and by distance."""
+    return {'before': before and asdict(before), 'after': after and asdict(after),
+            'per_distance': [{'length': error.length, 'before': error.before, 'after': error.after}
+                             for error in pooled_per_distance(legs)]}
 
 
 def plain(value: Any) -> Any:
@@ -125,7 +118,7 @@ def plain(value: Any) -> Any:
     return value
 
 
-def write_results(calibration: Calibration, config: Config, directory: Path,
+def write_results(calibration: result.Calibration, config: Config, directory: Path,
                   inputs: list[dict[str, Any]], created: str, force: bool = False,
                   warn: Callable[[str], None] = lambda note: None) -> list[Path]:
     """
@@ -147,7 +140,7 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
 class Results:
     """The result files of a calibration: ``write`` all but the report, then ``draw`` it."""
 
-    def __init__(self, calibration: Calibration, config: Config, directory: Path,
+    def __init__(self, calibration: result.Calibration, config: Config, directory: Path,
                  inputs: list[dict[str, Any]], created: str) -> None:
         self.directory = Path(directory)
         self.has_report = 'report' in config.output.formats
