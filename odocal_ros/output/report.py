@@ -142,7 +142,8 @@ def _draw_figures(
                                             reverse=True):
             if figures and size > MAX_BYTES:
                 break
-            drawn = leg_figures(evidence, f'leg{number}', _relative_scale_sigma(leg),
+            scale = texts.finite_estimate(leg_estimates(leg), 'scale_factor')
+            drawn = leg_figures(evidence, f'leg{number}', scale.relative_sigma,
                                 before_label([leg]), _smoother_details(leg))
             size += sum(len(svg) for _, _, svg in drawn)
             if not figures or size <= MAX_BYTES:
@@ -179,9 +180,3 @@ def _smoother_details(leg: result.LegResult) -> dict[str, Any]:
     """Return the details of the smoother for a leg, empty without it."""
     method = leg.methods.get('smoother')
     return method.details if method else {}
-
-
-def _relative_scale_sigma(leg: result.LegResult) -> float | None:
-    """Return the relative sigma of the leg's scale, None without one."""
-    scale = texts.finite_estimate(leg_estimates(leg), 'scale_factor')
-    return scale.sigma / abs(scale.value) if scale.value and scale.sigma else None

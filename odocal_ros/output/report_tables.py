@@ -16,8 +16,6 @@ from odocal_ros.output.summary import DEG, DEG_PER_HOUR
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 
-LABELS = tables.LABELS | {'scale_ratio': 'ratio to nominal',
-                          'scale_factor_as_sent': 'scale factor of the raw speed'}
 UNDETERMINED = 'not determined'
 # reasons about the data of a leg
 DATA_CODES = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
@@ -31,7 +29,7 @@ def label(name: str, local: bool = False) -> str:
     """Return an estimate, method or error source in words; local : positions in a local frame."""
     if name in result.wheel_factors([name]):
         return f'scale factor, {name.removeprefix(result.FACTOR)} wheel'
-    return result.name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
+    return tables.source_label(name, local)
 
 
 def estimate_texts(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
@@ -128,33 +126,27 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
     A cell is (sigma as text, share of the variance) or None below half a per cent.
     local : positions in a local frame.
     """
-    table = method.details.get('budget') or {}
-    table = {source: row for source, row in table.items() if isinstance(row, dict)}
+    table: dict[str, dict[str, Any]] = method.details.get('budget') or {}
     estimates = {name: texts.finite_estimate(method.estimates, name)
                  for row in table.values() for name in row if name != 'shared'}
     names = [name for name, estimate in estimates.items() if estimate.value is not None]
     heads, factors = zip(*(_column(name, estimates[name]) for name in names),
                          strict=True) if names else ((), ())
-    variances = [sum(_number(row, name)**2 for row in table.values()) for name in names]
+    variances = [sum(row.get(name, 0.0)**2 for row in table.values()) for name in names]
     rows, small = [], []
     min_share = 0.005    # of a variance
     for source, row in table.items():
-        shares = [_number(row, name)**2 / variance if variance else 0.0
+        shares = [row.get(name, 0.0)**2 / variance if variance else 0.0
                   for name, variance in zip(names, variances, strict=True)]
         if max(shares, default=0.0) < min_share:
             small.append(label(source, local))
             continue
-        cells = [None if share < min_share else (significant(_number(row, name) * factor), share)
+        cells = [None if share < min_share else (significant(row[name] * factor), share)
                  for name, factor, share in zip(names, factors, shares, strict=True)]
         rows.append((label(source, local), bool(row.get('shared')), cells))
     totals = [significant(math.sqrt(variance) * factor)
               for variance, factor in zip(variances, factors, strict=True)]
     return {'heads': heads, 'rows': rows, 'small': small, 'totals': totals} if rows else None
-
-
-def _number(row: dict[str, Any], name: str) -> float:
-    value = row.get(name, 0.0)
-    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
 
 
 def _column(name: str, estimate: result.Estimate) -> tuple[str, float]:

@@ -3,7 +3,6 @@
 
 """Figures of the scale: against speed, by window, and legs and methods side by side."""
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,7 +148,7 @@ def _draw_panels(panels: list[Panel], name: str, legs: int) -> style.Drawing:
     methods = dict.fromkeys(point.method for panel in panels for point in panel.points)
     styles = {method: STYLES[i % len(STYLES)] for i, method in enumerate(methods)}
     for ax, panel in zip(axes, panels, strict=True):
-        if panel.band is not None and all(map(math.isfinite, panel.band)):
+        if panel.band is not None:
             value, sigma = panel.band
             ax.axvspan(value - sigma, value + sigma, color=style.BAND, linewidth=0)
             ax.axvline(value, color=style.GREY, linewidth=0.8)

@@ -250,9 +250,8 @@ def _line(label: str, text: str) -> str:
 def _scale_text(scale: result.Estimate) -> str:
     if scale.value is None:
         return 'not determined'
-    relative = '' if not (scale.sigma and scale.value) else (
-        f'   ({texts.relative_text(scale.sigma / abs(scale.value))})')
-    return texts.with_unit(scale) + relative
+    relative = scale.relative_sigma
+    return texts.with_unit(scale) + (f'   ({texts.relative_text(relative)})' if relative else '')
 
 
 def _angle_text(angle: result.Estimate, width: int) -> str:

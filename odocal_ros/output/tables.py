@@ -25,7 +25,8 @@ SCALE_UNITS = {'scale_factor': '', 'scale_ratio': '1'}      # '': that of the ca
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
           'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion',
           'fix_latency': 'fix delay', 'gnss_delay': 'fix delay',
-          'receiver_smoothing': 'fix smoothing'}
+          'receiver_smoothing': 'fix smoothing', 'scale_ratio': 'ratio to nominal',
+          'scale_factor_as_sent': 'scale factor of the raw speed'}
 BUDGET_HEAD = ('error budget', 'scale, ppm', 'yaw, deg', 'pitch, deg')
 BUDGET_WIDTHS = 24, 13, 15, 15      # judgement: with 'shared' within 80 columns
 CHECKS = 'before', 'after'      # fields of LegResult: before and after the calibration
