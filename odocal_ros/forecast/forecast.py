@@ -131,7 +131,7 @@ def combine_sections(earlier: Forecast | None, newest: Forecast | None) -> Forec
         return newest or earlier
     sections = newest, earlier
     estimates = {name: min((section.estimates[name] for section in sections
-                            if name in section.estimates), key=_sigma_or_infinity)
+                            if name in section.estimates), key=sigma_or_infinity)
                  for name in {**earlier.estimates, **newest.estimates}}
     pitch = min((section.pitch for section in sections if section.pitch is not None), default=None)
     return replace(newest, scale=_combine_parameter(earlier.scale, newest.scale),
@@ -139,9 +139,12 @@ def combine_sections(earlier: Forecast | None, newest: Forecast | None) -> Forec
                    estimates=estimates, wheels=newest.wheels or earlier.wheels)
 
 
-def _sigma_or_infinity(estimate: Estimate) -> float:
-    """Return the sigma of an estimate, infinite without value or sigma."""
-    return math.inf if estimate.value is None or estimate.sigma is None else estimate.sigma
+def sigma_or_infinity(estimate: Estimate | None, relative: bool = False) -> float:
+    """Return the sigma of an estimate, relative to its value or not; infinite without one."""
+    if estimate is None or estimate.value is None:
+        return math.inf
+    sigma = estimate.relative_sigma if relative else estimate.sigma
+    return math.inf if sigma is None else sigma
 
 
 def _combine_parameter(earlier: ParameterForecast, newest: ParameterForecast) -> ParameterForecast:

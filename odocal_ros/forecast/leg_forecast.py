@@ -9,7 +9,7 @@ The forecast is shown to the operator, and is never part of a result.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -21,7 +21,6 @@ from odocal_ros.data.samples import take
 from odocal_ros.forecast import leg_so_far, smoother_forecast
 from odocal_ros.forecast.forecast import (
     Abandoned,
-    FARTHEST_LIMIT_M,
     Forecast,
     main_sources,
     ParameterForecast,
@@ -40,20 +39,12 @@ ORIENTATION_NS, ORIENTATION_ROWS = 10**9, 100
 DRIVE_ON = 'drive on with stops, starts and turns'
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedDrive(PlannedDrive):
-    """The recorded drive and its predicted rest; added manoeuvres continue from here."""
-
-    is_needed: Callable[[], bool] = field(default=lambda: True)    # False: raise Abandoned
-
-    def lengthen(self, metres: float) -> 'RecordedDrive':
-        """Return the drive extended straight ahead by ``metres``, at its median speed."""
-        if not self.is_needed():
-            raise Abandoned
-        moving = np.flatnonzero(np.abs(self.speed) > REST_SPEED)
-        speed = float(np.median(np.abs(self.speed[moving])))
-        t = np.linspace(0.0, metres / speed, 50)[1:]
-        return insert_section(self, int(moving[-1]), t, np.full_like(t, speed), np.zeros_like(t))
+def drive_on(drive: PlannedDrive, metres: float) -> PlannedDrive:
+    """Return the drive extended straight ahead by ``metres`` before its rest, at median speed."""
+    moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
+    speed = float(np.median(np.abs(drive.speed[moving])))
+    t = np.linspace(0.0, metres / speed, 50)[1:]
+    return insert_section(drive, int(moving[-1]), t, np.full_like(t, speed), np.zeros_like(t))
 
 
 def forecast_leg(leg: Leg, fix_rate: float, config: Config,
@@ -97,14 +88,19 @@ def _forecast_by_end_points(leg: Leg, fix_rate: float, config: Config,
     profile = leg_so_far.drive_profile(inputs, config)
     sigmas = Sigmas(config=_with_expected_heading(leg, config),
                     **leg_so_far.fix_and_count_accuracy(inputs, config) | {'fix_rate': fix_rate})
-    drive = _with_final_rest(_thin(profile), is_needed)
+    drive = _with_final_rest(_thin(profile))
     prediction = predict(drive, sigmas)
+
+    def lengthen(drive: PlannedDrive, metres: float) -> PlannedDrive:
+        if not is_needed():
+            raise Abandoned
+        return drive_on(drive, metres)
 
     def forecast(parameter: str, limit: float, why: str = '') -> ParameterForecast:
         sigma = prediction.sigma(parameter)
         metres = 0.0 if sigma is not None and sigma <= limit else None
         if metres is None and not why:
-            metres = find_remaining_distance(drive, sigmas, parameter, limit, FARTHEST_LIMIT_M)
+            metres = find_remaining_distance(drive, sigmas, parameter, limit, lengthen)
             why = UNREACHABLE
         return ParameterForecast(sigma, limit, metres,
                                  main_sources(prediction.method, parameter), why)
@@ -158,10 +154,9 @@ def _thin(drive: PlannedDrive) -> PlannedDrive:
                              for name in ('t', 'speed', 'yaw', 'slope')})
 
 
-def _with_final_rest(drive: PlannedDrive, is_needed: Callable[[], bool]) -> RecordedDrive:
+def _with_final_rest(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with a standstill of PREDICTED_REST_S seconds at its end."""
     moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
     rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
-    if rested < PREDICTED_REST_S:
-        drive = drive.cut_at(drive.duration, PREDICTED_REST_S - rested)
-    return RecordedDrive(**vars(drive), is_needed=is_needed)
+    return drive if rested >= PREDICTED_REST_S else drive.cut_at(
+        drive.duration, PREDICTED_REST_S - rested)

@@ -4,7 +4,7 @@
 """A planned or recorded drive as speed, yaw and slope by time, and manoeuvres added to it."""
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ QUARTER = np.pi / 2   # definition: rad
 TOWN_T = np.array([0.0, 5.0, 15.0, 40.0, 50.0, 60.0])
 TOWN_SPEED = np.array([0.0, 0.0, 12.0, 12.0, 0.0, 0.0])
 TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # turns of four minutes: left, left, right, right
-Drive = TypeVar('Drive', bound='PlannedDrive')
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +184,8 @@ def add_town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     return insert_section(drive, row, *map(np.concatenate, (t, speed, turn_angle)))
 
 
-def insert_section(drive: Drive, row: int, t: Floats, speed: Floats, turn_angle: Floats) -> Drive:
+def insert_section(drive: PlannedDrive, row: int, t: Floats, speed: Floats,
+                   turn_angle: Floats) -> PlannedDrive:
     """
     Return the drive with a section inserted after a row; later rows are delayed and rotated.
 

@@ -8,7 +8,7 @@ The planned drive is converted to a track, two marks and an alignment, as a reco
 processed by ``two_point.fit``: predictions and results have the same error budget.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from odocal_ros.calib.two_point import Chord, fit, refusal_reasons, refused_resu
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig, BadUsage
+from odocal_ros.forecast.forecast import FARTHEST_LIMIT_M
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.nav import rotations
 from odocal_ros.nav.alignment import (
@@ -43,6 +44,7 @@ from odocal_ros.settings.levels import SWAY
 from odocal_ros.settings.nominal import Grade, grade_with_turn_on_bias
 
 SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive determines it
+Lengthen = Callable[[PlannedDrive, float], PlannedDrive]
 EXTERNAL_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
 
 
@@ -142,22 +144,22 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
 
 
 def find_remaining_distance(drive: PlannedDrive, sigmas: Sigmas, parameter: str, limit: float,
-                            farthest: float = 1e5) -> float | None:
+                            lengthen: Lengthen = PlannedDrive.lengthen) -> float | None:
     """
     Return the additional straight distance, m, that brings a sigma down to its limit.
 
-    None if no distance up to ``farthest`` m is enough: a two-point yaw is never better than its
-    heading.
+    None if no distance up to FARTHEST_LIMIT_M is enough: a two-point yaw is never better than its
+    heading.   lengthen : function of the drive and m.
     """
     def is_enough(metres: float) -> bool:
-        longer = drive.lengthen(metres) if metres else drive
+        longer = lengthen(drive, metres) if metres else drive
         sigma = predict(longer, sigmas).sigma(parameter)
         return sigma is not None and sigma <= limit
 
     if is_enough(0.0):
         return 0.0
     # gyro drift may cancel the gain of a longer chord: try several lengths, then bisect
-    lengths = [farthest / 2**k for k in range(14, -1, -1)]
+    lengths = [FARTHEST_LIMIT_M / 2**k for k in range(14, -1, -1)]
     high: float | None = next((m for m in lengths if is_enough(m)), None)
     if high is None:
         return None

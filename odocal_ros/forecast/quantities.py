@@ -17,7 +17,7 @@ import numpy as np
 
 from odocal_ros.calib.choice import deciding_methods, PLANAR, REASON_ESTIMATES
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.forecast.forecast import Forecast
+from odocal_ros.forecast.forecast import Forecast, sigma_or_infinity
 from odocal_ros.forecast.planned_drive import drive_from_rates
 from odocal_ros.forecast.predict import plan_alignment
 from odocal_ros.nav.alignment import Alignment, HEADING_LIMIT
@@ -239,7 +239,7 @@ def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: 
         if quantity.needs_two_wheels and not two_wheels and not any(
                 part is not None and part.value is not None for part in parts):
             continue
-        sigmas[name] = max(_sigma_or_infinity(part, quantity.relative) for part in parts)
+        sigmas[name] = max(sigma_or_infinity(part, quantity.relative) for part in parts)
         if not valid or names_with_reason & set(quantity.estimates):
             unusable.add(name)
     return _check_sigmas(sigmas, config) | dict.fromkeys(unusable, NO)
@@ -269,11 +269,3 @@ def _check_sigmas(sigmas: dict[str, float | None], config: Config) -> dict[str, 
         elif name != 'track_width' or not config.odometer.track_width > 0:
             ok[name] = NO
     return ok
-
-
-def _sigma_or_infinity(estimate: Estimate | None, relative: bool) -> float:
-    """Return the sigma of an estimate, relative to its value or not; infinite without one."""
-    if estimate is None or estimate.value is None:
-        return math.inf
-    sigma = estimate.relative_sigma if relative else estimate.sigma
-    return math.inf if sigma is None else sigma

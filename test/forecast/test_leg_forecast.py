@@ -15,8 +15,9 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import leg_forecast
 from odocal_ros.forecast.forecast import Forecast, ParameterForecast, status_keys, UNREACHABLE
-from odocal_ros.forecast.leg_forecast import Abandoned, forecast_leg, RecordedDrive
+from odocal_ros.forecast.leg_forecast import Abandoned, drive_on, forecast_leg
 from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
+from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.live.answers import hint
 from odocal_ros.live.session import Session, SessionView
 from odocal_ros.pipeline.calibrate import calibrate
@@ -110,8 +111,8 @@ def test_a_drive_is_lengthened_at_its_own_speed_and_heading():
     t = np.arange(0.0, 61.0)
     speed = np.where((t < 10) | (t > 50), 0.0, 8.0)
     bend = np.where(t > 30, np.pi / 2, 0.0)
-    drive = RecordedDrive(t, speed, bend, np.zeros(61))
-    more = drive.lengthen(400.0)
+    drive = PlannedDrive(t, speed, bend, np.zeros(61))
+    more = drive_on(drive, 400.0)
     assert more.distance - drive.distance == pytest.approx(400.0)
     assert more.duration - drive.duration == pytest.approx(50.0)
     assert more.standstills(2.0)[-1] == pytest.approx((101.0, 110.0))
