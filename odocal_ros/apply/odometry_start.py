@@ -8,7 +8,7 @@ In: the first rows of IMU and wheels, or configured values. At rest, gravity giv
 gyro its bias; while driving, the tilt is less certain and the bias is that of the calibration.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,8 +32,7 @@ START_GAP = 0.5            # s; judgement: largest IMU gap in the samples of a s
 BRAKING_SIGMA = 2.0        # m/s^2; physical: mean acceleration over START_SPAN
 
 
-@dataclass(frozen=True, eq=False)
-class Start:
+class Start(NamedTuple):
     """State from which dead reckoning starts."""
 
     row: int                # of the IMU stream

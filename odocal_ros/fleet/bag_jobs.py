@@ -22,7 +22,7 @@ import signal
 import tempfile
 import threading
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,8 +67,7 @@ class BagJob:
                         **fields)
 
 
-@dataclass(frozen=True)
-class BagOutcome:
+class BagOutcome(NamedTuple):
     """The report on a bag to the command; the rest is in its row."""
 
     key: str            # of its row

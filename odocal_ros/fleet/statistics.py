@@ -15,7 +15,7 @@ the values.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ MODEL_OUTLIER_SIGMAS = 4.0
 MIN_VEHICLES = 3            # judgement: for a spread
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """A step: from leg ``leg`` on, by ``size`` of the value, with its sigma."""
 
     leg: int
@@ -37,8 +36,7 @@ class Change:
     sigma: float
 
 
-@dataclass(frozen=True)
-class History:
+class History(NamedTuple):
     """The history of a value; legs are counted from 0."""
 
     changes: tuple[Change, ...] = ()       # in order
@@ -131,8 +129,7 @@ def _fit(z: Floats, X: Floats) -> tuple[Floats, Floats]:
     return C @ (X.T @ z), np.sqrt(np.diag(C))
 
 
-@dataclass(frozen=True, eq=False)
-class Population:
+class Population(NamedTuple):
     """Values of the vehicles of a vehicle model."""
 
     mean: float           # robust

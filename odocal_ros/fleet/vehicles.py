@@ -10,11 +10,10 @@ and legs, and its calibration.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,17 +38,12 @@ MIN_REJECTED_LEGS = 2           # judgement: last legs, all rejected; one alone 
 FAILED_REMEDY = 'See the column failures of vehicles.parquet for the reason of each bag.'
 
 
-@dataclass(frozen=True, eq=False)
-class DrivenLeg:
-    """A leg with the odometer reading of its bag, km."""
+class DrivenLeg(NamedTuple):
+    """A leg with its values, and the odometer reading of its bag, km."""
 
     leg: LegResult
+    estimates: dict[str, Estimate]      # each from the method that gives it
     odometer_km: float | None
-
-    @cached_property
-    def estimates(self) -> dict[str, Estimate]:
-        """Return the leg's values, each from the method that gives it."""
-        return leg_estimates(self.leg)
 
 
 def legs_by_time(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenLeg]:
@@ -60,7 +54,8 @@ def legs_by_time(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenL
     with_names, _ = unique_names([Path(row.bag) for row in rows], legs, entries)
     km = [bags[row.bag].odometer_km if row.bag in bags else row.odometer_km
           for row, bag_legs in zip(rows, legs, strict=True) for _ in bag_legs]
-    return sorted(map(DrivenLeg, with_names, km), key=lambda driven: driven.leg.start_ns)
+    driven = map(DrivenLeg, with_names, map(leg_estimates, with_names), km)
+    return sorted(driven, key=lambda driven: driven.leg.start_ns)
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,10 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass
 from datetime import datetime, UTC
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from odocal_ros.data.inputs import TOPICS
 from odocal_ros.errors import BadUsage
@@ -56,8 +55,7 @@ class Notes(Listener):
         return self._listener.phase(title)
 
 
-@dataclass(frozen=True)
-class LegSpan:
+class LegSpan(NamedTuple):
     """A requested leg; None: from the start, or to the end, of the recording."""
 
     start_ns: int | None

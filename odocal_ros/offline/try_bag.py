@@ -10,12 +10,11 @@ opens the report in a browser.
 
 import argparse
 from collections.abc import Collection
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import shlex
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadData
@@ -88,8 +87,7 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-@dataclass(frozen=True)
-class _Choice:
+class _Choice(NamedTuple):
     """The selected topic of a slot with several candidates."""
 
     slot: str
@@ -204,13 +202,10 @@ def _setting_reason(setting: str, content: dict[str, Any], user_settings: Collec
     name, _, value = setting.partition('=')
     if setting in user_settings:
         return 'given by --set'
-    if name == 'imu.mounting_rpy':
-        return _mounting_reason(content['mounting'])
-    return SETTING_REASONS.get(name) or (BY_TOPIC_NAME if value == 'topic' else BY_MOTION)
-
-
-def _mounting_reason(mounting: dict[str, Any]) -> str:
+    if name != 'imu.mounting_rpy':
+        return SETTING_REASONS.get(name) or (BY_TOPIC_NAME if value == 'topic' else BY_MOTION)
     from odocal_ros.offline.inspection_text import whole_degrees
+    mounting = content['mounting']
     if mounting['assumed_forward']:
         return 'up is measured from gravity; x is assumed to be forward'
     return ('up is measured from gravity, forward from accelerations and turns '
