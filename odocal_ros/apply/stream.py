@@ -141,20 +141,17 @@ class SpikeScreen:
                 self._implausible_until = row.t + IMPLAUSIBLE_TIME
         return self._step_size
 
-    def _exceeds_usual(self, step: Step) -> tuple[bool, bool]:
+    def _exceeds_usual(self, step: Step) -> tuple[bool, ...]:
         """Return True for gyro and force if the step is implausible for a vehicle."""
-        (turn, force), (usual_turn, usual_force) = step, self._mean_steps
-        return (turn > max(1.0, glitches.USUAL_STEPS * usual_turn),
-                force > max(1.0, glitches.USUAL_STEPS * usual_force))
+        return tuple(size > max(1.0, glitches.USUAL_STEPS * usual)
+                     for size, usual in zip(step, self._mean_steps, strict=True))
 
     def _update_usual_step(self, step: Step) -> None:
         """Update the mean step; a single spike has little effect."""
-        (turn, force), (usual_turn, usual_force) = step, self._mean_steps
-        self._mean_steps = (
-            usual_turn + (min(turn, 4 * usual_turn + 1 / glitches.USUAL_STEPS) - usual_turn)
-            / USUAL_ROWS,
-            usual_force + (min(force, 4 * usual_force + 1 / glitches.USUAL_STEPS) - usual_force)
-            / USUAL_ROWS)
+        turn, force = (
+            usual + (min(size, 4 * usual + 1 / glitches.USUAL_STEPS) - usual) / USUAL_ROWS
+            for size, usual in zip(step, self._mean_steps, strict=True))
+        self._mean_steps = turn, force
 
     def _rows_until_return(self, last: Row, rows: Sequence[Row], step: Step) -> int | None:
         """Return the number of rows until the values are back after a step, None if never."""

@@ -34,11 +34,7 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.time_series import running_integral
 from odocal_ros.pipeline.calibrate import faults, screen_leg, Screened
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.imu_orientation import (
-    estimate_orientation,
-    orientation_reasons,
-    UNUSABLE,
-)
+from odocal_ros.screening import imu_orientation
 from odocal_ros.screening.inputs import Inputs, locate_fixes, LocatedFixes
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config, SETTINGS, with_settings
@@ -215,16 +211,17 @@ class SmootherSoFar:
             raise BadData(reason.text)
         _raise_if_unusable(screened.reasons)
         located = _locate_or_raise(inputs, config)
-        _raise_if_unusable(orientation_reasons(estimate_orientation(inputs, located.rough_scale),
-                                               config.imu.nominal_yaw))
+        orientation = imu_orientation.estimate_orientation(inputs, located.rough_scale)
+        _raise_if_unusable(imu_orientation.orientation_reasons(
+            orientation, config.imu.nominal_yaw))
         if vars(located.origin) != (self._origin and vars(self._origin)):
             self._origin = located.origin
             self._growing.forget()
         spans = inputs.standstills(located.rough_scale, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
-        smoother_leg = make_smoother_leg(inputs, config, located.origin, located.fixes_n, spans,
-                                         located.rough_scale, t_stop)
+        smoother_leg = make_smoother_leg(
+            inputs, config, located.origin, located.fixes_n, spans, located.rough_scale, t_stop)
         reason = missing_samples_reason(smoother_leg)
         if reason:
             raise BadData(reason.text)
@@ -233,5 +230,5 @@ class SmootherSoFar:
 
 def _raise_if_unusable(reasons: Iterable[Reason]) -> None:
     for reason in reasons:
-        if reason.code in UNUSABLE:
+        if reason.code in imu_orientation.UNUSABLE:
             raise BadData(reason.text)

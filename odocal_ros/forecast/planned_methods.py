@@ -9,6 +9,7 @@ drive: IMU, odometer and fixes without errors.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,7 +39,7 @@ from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.geodesy import earth_rate_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose
-from odocal_ros.nav.time_series import running_integral
+from odocal_ros.nav.time_series import interpolated, running_integral
 from odocal_ros.reasons import Code, Reason, rejecting, Verdict, verdict_of
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import grade_of
@@ -58,8 +59,7 @@ class IdealSamples:
     fixes_in_one: float     # number of planned fixes that each fix of the leg replaces
 
 
-@dataclass(frozen=True, eq=False)
-class _Motion:
+class _Motion(NamedTuple):
     """Motion of the IMU, and travel of the odometer."""
 
     t: Floats         # (m,) s
@@ -95,7 +95,7 @@ def ideal_samples(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> IdealS
     leg = SmootherLeg(
         origin=origin, t_begin=t_begin, t_stop=drive.duration, t_imu=t, w_b=motion.w_b,
         f_b=motion.f_b, travel=Travel(t, motion.travel, sigmas.quantum), t_fix=t_fix,
-        fixes_n=np.stack([np.interp(t_fix, t, x) for x in antenna.T], -1),
+        fixes_n=interpolated(t_fix, t, antenna),
         covariance_n=np.tile(sigmas.covariance_n, (len(t_fix), 1, 1)), standstills=spans,
         rough_scale=1.0, nominal_scale=1.0, scale_unit='1',
         imu_arm=np.array(config.imu.lever_arm, float),

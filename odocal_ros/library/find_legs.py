@@ -14,7 +14,7 @@ import numpy as np
 
 from odocal_ros.bagio.read import Bag
 from odocal_ros.bagio.segments import DROPPED_EVENTS, STATUS_NAME, STATUS_TYPE
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
@@ -209,7 +209,7 @@ def standstills_of(inputs: Inputs, first: int, config: Config) -> Standstills:
         return Standstills(np.empty((0, 2), np.int64), np.empty((0, 2)), 0.0)
     scale = locate_fixes(inputs, config).rough_scale or 1.0
     spans = inputs.standstills(scale, config)
-    path_length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
+    path_length = running_sum(np.abs(np.diff(inputs.travel.s))) * scale
     metres = np.interp(spans, inputs.travel.t, path_length) if len(spans) else np.empty((0, 2))
     return Standstills(first + np.round(spans * 1e9).astype(np.int64), metres,
                        float(path_length[-1]))

@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.planned_drive import (
     drive_from_rates,
@@ -97,7 +97,7 @@ def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
         if speed is None:
             raise BadUsage(f'{path}: the track has no times; give --speed')
         steps = np.hypot(*np.diff(position_n[:, :2], axis=0).T)
-        t = np.concatenate([[0.0], np.cumsum(steps / speed)])
+        t = running_sum(steps / speed)
     return _from_points(path, t, position_n, geodetic[0])
 
 
@@ -198,8 +198,8 @@ def _used_points(points: Floats, path: Path) -> Ints:
 
 def _moving_mean(x: Floats, window: int) -> Floats:
     """Return means over an odd number of rows; the end values are extended: (n,)."""
-    total = np.concatenate([[0.0], np.cumsum(np.pad(x, window // 2, mode='edge'))])
-    return np.asarray((total[window:] - total[:-window]) / window)
+    total = running_sum(np.pad(x, window // 2, mode='edge'))
+    return (total[window:] - total[:-window]) / window
 
 
 def from_bag(path: Path, config: Config, topics: dict[str, str],

@@ -18,6 +18,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import MAX_DAYS
 from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.raws import tables
+from odocal_ros.nav.time_series import running_integral
 from odocal_ros.offline.survey import FixPath
 from odocal_ros.screening.glitches import is_impossible
 from odocal_ros.settings.config import SIDES
@@ -92,8 +93,7 @@ class ListCollector:
 def _travelled(t: Floats, value: Floats, field: str) -> Floats:
     """Return the travel of each of k values, (n, k), from values (n, k) at t, (n,) s."""
     if field == 'velocity':
-        mean = (value[1:] + value[:-1]) / 2 * np.diff(t)[:, None]
-        return np.concatenate([np.zeros((1, value.shape[1])), np.cumsum(mean, axis=0)])
+        return running_integral(t, value)
     if field == 'position':
         inside = (np.abs(value) <= np.pi + 0.01).all(axis=0)
         return np.where(inside, np.unwrap(value, axis=0), value)
@@ -112,8 +112,7 @@ def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | 
     grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MAX_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
         return sides
-    turned = np.append(0.0, np.cumsum((imu[1][1:] + imu[1][:-1]) / 2 * np.diff(imu[0])))
-    turn = np.diff(np.interp(grid, imu[0], turned))
+    turn = np.diff(np.interp(grid, imu[0], running_integral(*imu)))
     turn = turn - np.median(turn)
     step = np.stack([np.diff(np.interp(grid, t, travel)) for travel in s.T])
     path_length = np.abs(step).sum(axis=1, keepdims=True)

@@ -29,6 +29,7 @@ from odocal_ros.data.arrays import (
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
+from odocal_ros.nav.time_series import interpolated
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs, LocatedFixes
 from odocal_ros.settings.config import Config
@@ -187,7 +188,7 @@ def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, fl
                       _without_slow_changes(force, SLOW_FORCE))
     if odometer:
         yield 'odometer', odometer
-    position = np.stack([np.interp(edges, t_fix, axis) for axis in located.fixes_n[:, :2].T], -1)
+    position = interpolated(edges, t_fix, located.fixes_n[:, :2])
     fix = _delay(_without_slow_changes(_chords(position), SLOW_SPEED),
                  _without_slow_changes(_chords(travel.at(edges)[:, None]), SLOW_SPEED), odometer)
     if fix:

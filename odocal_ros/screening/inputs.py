@@ -12,13 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, medians
+from odocal_ros.nav import geodesy
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
-from odocal_ros.nav.geodesy import (
-    ecef_from_geodetic,
-    MIN_GNSS_MOTION,
-    MIN_LOCAL_MOTION,
-    rate_without_north,
-)
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.settings.config import Config
@@ -76,7 +71,7 @@ class Inputs:
     @property
     def min_motion(self) -> float:
         """Return the minimum distance between positions that is certainly motion, m."""
-        return MIN_LOCAL_MOTION if self.is_local else MIN_GNSS_MOTION
+        return geodesy.MIN_LOCAL_MOTION if self.is_local else geodesy.MIN_GNSS_MOTION
 
     def standstills(self, metres_per_unit: float, config: Config) -> Floats:
         """Return the standstills of ``leg.standstill`` or longer, begin and end: (k, 2) s."""
@@ -110,7 +105,7 @@ def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
     origin = median_origin(inputs.t_fix, inputs.geodetic)
     if inputs.is_local:
         latitude = np.deg2rad(config.reference.latitude_deg)
-        origin = replace(origin, local_earth_rate=rate_without_north(float(latitude)))
+        origin = replace(origin, local_earth_rate=geodesy.rate_without_north(float(latitude)))
     geodetic = inputs.geodetic.copy()
     no_height = np.isnan(geodetic[:, 2])
     geodetic[no_height, 2] = origin.height
@@ -130,7 +125,7 @@ def median_origin(t_fix: Floats, geodetic: Floats) -> Origin:
     """
     fixes_at_start = 11    # judgement: nearest to the start mark
     rows = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:fixes_at_start])
-    r_e = ecef_from_geodetic(geodetic[rows, 0], geodetic[rows, 1], 0.0)
+    r_e = geodesy.ecef_from_geodetic(geodetic[rows, 0], geodetic[rows, 1], 0.0)
     central = rows[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
     latitude, longitude, height = geodetic[central].tolist()
     heights = geodetic[~np.isnan(geodetic[:, 2]), 2] if np.isnan(height) else [height]

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, chunks, Floats, Ints, map_windows, work_array
+from odocal_ros.data.arrays import Bools, chunks, Floats, Ints, work_array
 from odocal_ros.data.inputs import INPUTS, WHEELS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import Samples, take
 from odocal_ros.nav.geodesy import LARGEST_FRAME
-from odocal_ros.nav.time_series import gaps_in_rhythm
+from odocal_ros.nav.time_series import gaps_in_rhythm, gaps_longer
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import glitches
 from odocal_ros.screening.leg_kind import is_local
@@ -42,9 +42,8 @@ def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[
     """Return IMU_GAP if IMU data is missing for over ``limit`` s between t_from and t_stop."""
     t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
               np.searchsorted(t_imu, t_stop + 1e-9, side='right')]
-    rows = np.flatnonzero(map_windows(lambda t: np.diff(t) > limit, t))      # before long gaps
-    intervals = [(t_from, t[0]), *zip(t[rows], t[rows + 1], strict=True), (t[-1], t_stop)] \
-        if len(t) else [(t_from, t_stop)]
+    intervals = [(t_from, t[0]), *gaps_longer(t, limit), (t[-1], t_stop)] if len(t) else [
+        (t_from, t_stop)]
     gaps = [(float(end - begin), float(begin)) for begin, end in intervals if end - begin > limit]
     if not gaps:
         return ()
