@@ -74,9 +74,10 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
         return (), slip.NO_SLIPS
     pair = regression.without_gyro_drift(pair)
     regressors = regression.right_path_regressors(pair, metres_per_unit)
-    x, covariance = regression.fit_right_path(pair, regressors, metres_per_unit)
-    if x is None or covariance is None or x[0] <= 0:
+    fit = regression.fit_right_path(pair, regressors, metres_per_unit)
+    if fit is None:
         return (), slip.NO_SLIPS
+    x, covariance = fit
     ratio = x[0]                                          # right counts over left ones
     per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
     width = track_width or abs(x[1]) * per_right

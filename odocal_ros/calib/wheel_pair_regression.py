@@ -10,6 +10,7 @@ different counters, and a ratio that changes.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,12 +28,20 @@ BIAS_REST = 5.0
 # rad/s: a faster turn at rest is that of a ferry or a turntable. Physical: consumer IMUs drift by
 # 0.5 to 1.3 deg/s
 MAX_DRIFT = np.deg2rad(2.0)
-# judgement: steps of 0.1 s over which speed and turn rate are averaged; also a cell of the fit
+# judgement: steps of the pair, 0.1 s each, over which speed and turn rate are averaged; also a
+# cell of the fit
 MEAN_STEPS = 10
+MIN_FIT_CELLS = 20      # judgement: of a fit
+# priors of the fit: s, sigma of the delay between the wheels, and of wheels to IMU, by drivers'
+# delays; s^2/m, sigma of the change of rolling radius by sideways acceleration. Physical
+DELAY_SIGMA, LOAD_SIGMA = 0.05, 2e-3
+DELAY_WIDTH = 1.5       # m, judgement: a delay to the IMU acts as this track width times it
+# least sigma of the travel in a cell, counts and m: judgement, rounding of one edge, and a bump
+MIN_TRAVEL_SIGMA = 0.4, 1e-3
 
 
 def without_gyro_drift(pair: WheelPair) -> WheelPair:
-    """Return the wheels with the turn rate of standstills, the gyro bias, removed in between."""
+    """Return the wheels with the gyro bias, measured at standstills, removed from the turn."""
     still = pair.known & (np.diff(pair.left) == 0) & (np.diff(pair.right) == 0)
     # half a second after a stop and before a start the body rocks
     rests = [(begin + MEAN_STEPS // 2, end - MEAN_STEPS // 2) for begin, end in runs(still)
@@ -63,32 +72,39 @@ def right_path_regressors(pair: WheelPair, metres_per_unit: float) -> Floats:
 
 
 def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
-                   ) -> tuple[Floats, Floats] | tuple[None, None]:
-    """Return coefficients, (k,), and their covariance; regressors: (n, 6) as above and others."""
+                   ) -> tuple[Floats, Floats] | None:
+    """
+    Return coefficients, (k,), and their covariance; None with few cells or a ratio below 0.
+
+    regressors : (n, 6) as above, and others.
+    """
     edges = np.arange(0, len(pair.t), MEAN_STEPS)      # of cells of a second
     design, y = np.diff(regressors[edges], axis=0), np.diff(pair.right[edges])
     keep = np.logical_and.reduceat(pair.known, edges[:-1])[:len(y)]
     keep &= np.abs(design[:, 0]) + np.abs(y) > 2 * pair.quantum
-    if keep.sum() < 20:
-        return None, None
+    if keep.sum() < MIN_FIT_CELLS:
+        return None
     width_sigma = TRACK_WIDTH.first_sigma / metres_per_unit
-    delay_sigma = 0.05     # s, sigma of the delay between the wheels, and of wheels to IMU
-    usual_width = 1.5       # m: the delay to the IMU acts as this width times the delay
-    load_sigma = 2e-3     # s^2/m, of the change of rolling radius by sideways acceleration
-    prior = np.array([np.inf, width_sigma, np.inf, delay_sigma,
-                      delay_sigma * usual_width / metres_per_unit, load_sigma])
+    prior = np.array([np.inf, width_sigma, np.inf, DELAY_SIGMA,
+                      DELAY_SIGMA * DELAY_WIDTH / metres_per_unit, LOAD_SIGMA])
     prior = np.append(prior, np.full(regressors.shape[1] - len(prior), np.inf))
-    min_sigma = 0.4 * pair.quantum + 1e-3 / metres_per_unit
+    counts, metres = MIN_TRAVEL_SIGMA
+    min_sigma = counts * pair.quantum + metres / metres_per_unit
     x, covariance, _ = robust_fit(design[keep], y[keep], min_sigma, prior)
-    return x, covariance
+    return (x, covariance) if x[0] > 0 else None
 
 
 def side_reasons(pair: WheelPair, width: float, sigma: float,
                  track_width: float) -> tuple[Reason, ...]:
-    """Return the reason if the sides are wrong or untested; width: by the regression, m."""
+    """
+    Return WHEEL_DEAD, WHEELS_SWAPPED or ODOMETER_CHOSEN, else ().
+
+    width, sigma : track width by the regression, m; negative if the sides are swapped.
+    track_width : m, as configured; 0 unknown.
+    """
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least, track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
-                       f'would be {width:.3f} m, ± {sigma:.2g} m. Likely cause: one counter is '
+                       f'would be {width:.3f} ± {sigma:.2g} m. Likely cause: one counter is '
                        'sent twice', SENT_TWICE_REMEDY),)
     if width - WHOLE_DRIVE_SIGMAS * sigma <= 0 < width + WHOLE_DRIVE_SIGMAS * sigma:
         return (Reason(Code.ODOMETER_CHOSEN, 'too few turns to test whether left and right wheel '
@@ -97,7 +113,16 @@ def side_reasons(pair: WheelPair, width: float, sigma: float,
     if width > 0:
         return ()
     return (Reason(Code.WHEELS_SWAPPED, f'the {pair.names[0]} wheel travels farther in left turns '
-                   f'(track width {width:.2f} m, ± {sigma:.2g} m)'),)
+                   f'(track width {width:.2f} ± {sigma:.2g} m)'),)
+
+
+class RatioChange(NamedTuple):
+    """A change of the ratio of the wheels at a place of the path."""
+
+    sigmas: float
+    change: float      # relative
+    share: float       # of the path before it
+    row: int
 
 
 def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: float,
@@ -109,25 +134,26 @@ def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: floa
     wheel_count : number of wheels in the mean.
     """
     path = running_sum(np.abs(np.diff(pair.left)))
-    best = (0.0, 0.0, 0.0, 0)      # change in sigmas, change, share of the path, row
+    best: RatioChange | None = None
     for share in np.arange(1, 8) / 8:       # tested places, shares of the path
         row = int(np.searchsorted(path, share * path[-1]))
         left_after = np.where(np.arange(len(path)) > row, pair.left - pair.left[row], 0.0)
-        x, covariance = fit_right_path(
-            pair, np.column_stack([regressors, left_after]), metres_per_unit)
-        if x is None or covariance is None or x[0] <= 0:
+        fit = fit_right_path(pair, np.column_stack([regressors, left_after]), metres_per_unit)
+        if fit is None:
             continue
+        x, covariance = fit
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
         # 2e-3: tyres that warm up differently change the ratio by less
         limit = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)
-        if abs(change) > limit and abs(change) / sigma > best[0]:
-            best = (abs(change) / sigma, float(change), share, row)
-    sigmas, change, share, row = best
-    if not change:
+        if abs(change) > limit and (best is None or abs(change) / sigma > best.sigmas):
+            best = RatioChange(abs(change) / sigma, float(change), share, row)
+    if best is None:
         return (), 0.0
-    # the ratio before or after may be correct: that of the fit is between, (1 - share) of the
-    # change from that before. rms of both errors, so that it is the change for a share of half
+    sigmas, change, share, row = best
+    # if the change is at ``share`` of the path, the mean ratio is wrong by (1 - share) of it (the
+    # ratio before is correct) or by share of it: rms of both, scaled to 1 at a share of half
     at_half = float(change * np.sqrt(2 * (share**2 + (1 - share)**2)))
+    half = 50 * abs(at_half)      # %, of the change
     left, right = pair.names
     return (Reason(Code.WHEEL_SLIP, f'from t = {pair.t[row]:.0f} s on, after about '
                    f'{100 * share:.0f} % of the path, the {right} wheel counts '
@@ -135,8 +161,8 @@ def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: floa
                    f'{"more" if change > 0 else "less"} relative to the {left} wheel and the '
                    'gyro. Likely cause: continuous slip or a tyre that loses pressure. Which '
                    'section is correct cannot be decided from the data: '
-                   f'{50 / wheel_count * abs(at_half):.2f} % is added to the uncertainty of the '
-                   f'scale, {50 * abs(at_half):.2f} % to that of each wheel'),), at_half
+                   f'{half / wheel_count:.2f} % is added to the uncertainty of the scale, '
+                   f'{half:.2f} % to that of each wheel'),), at_half
 
 
 def counter_reasons(pair: WheelPair, ratio: float, width: float,
