@@ -106,8 +106,7 @@ class Odometry:
         if slot == 'imu':
             self.imu.feed(usable)
         else:
-            self.wheels.feed(slot, usable, form or COUNTER)
-        self.wheels.zero_ns = self.imu.zero_ns
+            self.wheels.feed(slot, usable, form or COUNTER, self.imu.zero_ns)
 
     def missing_odometer_s(self) -> float:
         """Return the time from the newest odometer row to the next pose, s; inf without a path."""

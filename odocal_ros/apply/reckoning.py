@@ -30,12 +30,13 @@ from odocal_ros.apply.attitude import (
     Vector,
     ZERO,
 )
+from odocal_ros.apply.delay_search import DelaySearch
 from odocal_ros.apply.errors import BA, BG, DRIVING_FORCE, GRAVITY, PHI
 from odocal_ros.apply.odometry_start import Start
 from odocal_ros.apply.pose import covariances, pack_pose, Pose, velocity_variances
 from odocal_ros.apply.stream import IMU_GAP_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
-from odocal_ros.apply.wheels import DelaySearch, Wheels
+from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.standstill import REST_TURN
 from odocal_ros.settings.levels import FASTEST
@@ -62,7 +63,7 @@ class DeadReckoning:
                  config: ApplyConfig, notes: list[str], delay_sigma: float) -> None:
         self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
         self._notes, self.failed = notes, ''
-        self._delay = DelaySearch(SPEED_SPAN, delay_sigma, notes)
+        self._delay = DelaySearch(SPEED_SPAN, delay_sigma)
         # state at the time _t of an IMU row
         self.imu.drop(start.row)
         self._t = self.imu.rows[self.imu.path_row].t
@@ -234,10 +235,13 @@ class DeadReckoning:
             rate_variance = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
             rate_b = w.mean(axis=0) - self.bias - np.transpose(self._C_nb) @ self._earth_rate_n
             self._correct(self.errors.correct_by_rest(rate_b, rate_variance))
-        self.errors.changed |= self._delay.add(
+        note = self._delay.add(
             rotate_vector(self._C_nb, self._forward_b),
             velocity - self._v_corrected if has_travel and self._force_is_usable else None,
             self._dv_n, T)
+        if note:
+            self._notes.append(note)
+            self.errors.changed = True
         self._was_resting = is_resting
         self._t_corrected, self._v_corrected = self._t, self._velocity_n(self._t)
         self._dv_n, self._force_is_usable, self._rates = ZERO, True, []
@@ -288,7 +292,7 @@ class DeadReckoning:
         forward_n = rotate_vector(self._C_nb, self._forward_b)
         # a delay changes the position by delay times the change of velocity by accelerations along
         # the path; a clock step also changes the time of the pose
-        delay_sigma = math.hypot(self._delay.sigma_s, self._clock_step, self.wheels.delay_s)
+        delay_sigma = math.hypot(self._delay.sigma_s, self._clock_step, self.wheels.delay_sigma_s)
         by_delay = (*add_scaled(ZERO, add_scaled(self._turned_velocity_n, forward_n, -speed),
                                 delay_sigma),
                     *add_scaled(ZERO, rotate_vector(self._C_nb, rate_b), self._clock_step))

@@ -87,7 +87,7 @@ class RowTimes:
         return self._t
 
     @property
-    def delay_s(self) -> float:
+    def delay_sigma_s(self) -> float:
         """Return the sigma of the delay that all times have in common, s."""
         return DELAY_SIGMA * self._mean_delay if self._in_use() else 0.0
 

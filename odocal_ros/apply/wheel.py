@@ -104,9 +104,9 @@ class Wheel:
         return 2.0 * deviation**2 * share**2 + (self._row_times.rate_error * travel)**2
 
     @property
-    def delay_s(self) -> float:
+    def delay_sigma_s(self) -> float:
         """Return the sigma of the constant delay of the rows, s."""
-        return self._row_times.delay_s
+        return self._row_times.delay_sigma_s
 
     def interpolation_variance(self, t: float) -> float:
         """Return the variance by interpolation of the travel at a time, m^2."""

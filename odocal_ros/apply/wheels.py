@@ -2,23 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Travel of a vehicle by one or two wheels in a stream, and the delay of the IMU relative to it.
+Travel of a vehicle by one or two wheels in a stream.
 
-In: odometer rows of one or two topics. Out: travel between any two times, with its variance. A
-``Wheel`` tests the rows of one topic; ``DelaySearch`` compares the IMU's acceleration with them.
+In: odometer rows of one or two topics, each tested by its ``Wheel``. Out: travel between any two
+times, with its variance.
 """
 
-from collections import deque
 from collections.abc import Sequence
 import math
 
-import numpy as np
-
-from odocal_ros.apply.attitude import Vector
-from odocal_ros.apply.errors import GRAVITY
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheel import Wheel
-from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import OdometerForm, Reading
 from odocal_ros.nav.standstill import REST_TRAVEL
 from odocal_ros.settings.node_configs import ApplyConfig
@@ -26,15 +20,7 @@ from odocal_ros.settings.node_configs import ApplyConfig
 STILL_COUNTS = 1.5    # physical: largest number of counts of a wheel at rest
 SIDES = ('odometer', 'odometer_right')
 Rows = tuple[str, Sequence[Reading], OdometerForm]
-# judgement: least and largest number of rows of the regression, one per second; s, correlation of
-# residuals
-MIN_DELAY_ROWS, MAX_DELAY_ROWS, LAGS = 60, 300, 4
-# judgement: least delay that is reported, s and sigmas. 168 simulated drives without a delay had
-# up to 0.028 s and 2.5 sigmas at their ends; of 60 others none was reported at any second
-MIN_DELAY, DELAY_SIGMAS = 0.04, 4.0
-# judgement: ratio of the change of acceleration within a second to the central difference over
-# two, in simulated town drives
-CHANGE_RATIO = 1.2
+MAX_WAITING = 100       # judgement: blocks of rows kept before the first IMU message
 
 
 class Wheels:
@@ -47,26 +33,26 @@ class Wheels:
         self._has_two_topics = config.odometer.has_two_topics
         self._waiting: list[Rows] = []       # blocks from before the first IMU message
         self._wheels: dict[str, Wheel] = {}
-        self.zero_ns = 0
         self.quantum = 0.0                   # m, size of a count of the travel
 
-    def feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm) -> None:
-        """Add rows of a wheel."""
+    def feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm, zero_ns: int) -> None:
+        """Add rows of a wheel; zero_ns : stamp of t = 0, 0 before the first IMU message."""
         self._waiting.append((slot, rows, form))
-        if not self.zero_ns:
-            self._waiting = self._waiting[-100:]
+        if not zero_ns:
+            self._waiting = self._waiting[-MAX_WAITING:]
             return
-        for slot, rows, form in self._waiting:
-            self._feed(slot, rows, form)
+        for block in self._waiting:
+            self._add_rows(*block, zero_ns)
         self._waiting = []
 
-    def _feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm) -> None:
-        """Add rows after the first IMU message, whose stamp is t = 0."""
+    def _add_rows(self, slot: str, rows: Sequence[Reading], form: OdometerForm,
+                  zero_ns: int) -> None:
+        """Add rows after the first IMU message."""
         if slot not in self._wheels:
             self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
             self._set_scales(form)
         wheel = self._wheels[slot]
-        since_ns = self._offset_ns - self.zero_ns
+        since_ns = self._offset_ns - zero_ns
         wheel.feed([(stamp + since_ns) * 1e-9 for stamp, *_ in rows],
                    [value for _, _, value in rows])
         self._notes += wheel.notes
@@ -106,15 +92,17 @@ class Wheels:
     def variances(self, t: float, T: float) -> tuple[float, float]:
         """Return the variances of the travel at t, and of the travel in the T s before, m^2."""
         wheels, squared_count = self._wheels.values(), len(self._wheels)**2
+        # a travel is the difference of two readings, each with a rounding of quantum^2 / 12; the
+        # jitter of a travel is that of its two ends
         rounding = self.quantum**2 / 6
         jitter = sum(wheel.jitter_variance(t, T) for wheel in wheels) / squared_count
         interpolation = sum(wheel.interpolation_variance(t) for wheel in wheels) / squared_count
         return rounding + interpolation + jitter / 2, rounding + jitter
 
     @property
-    def delay_s(self) -> float:
+    def delay_sigma_s(self) -> float:
         """Return the sigma of the constant delay of the rows, s."""
-        return max(wheel.delay_s for wheel in self._wheels.values())
+        return max(wheel.delay_sigma_s for wheel in self._wheels.values())
 
     def are_still(self, t_from: float, t_to: float) -> bool:
         """Return True if no wheel turned between two times and no counter hangs."""
@@ -126,72 +114,3 @@ class Wheels:
         """Drop the rows before a time, s."""
         for wheel in self._wheels.values():
             wheel.forget(t)
-
-
-class DelaySearch:
-    """
-    Regression of force minus acceleration on the change of acceleration, one row per second.
-
-    If the IMU is tau s late, its velocity is that of tau s earlier: the change in a second differs
-    by -tau times the change of acceleration. A constant (tilt, bias) is estimated too.
-
-    span_s : averaging time of the odometer's speeds, which are late by half of it.   sigma_s :
-    configured sigma of the delay, increased if a delay is found.   notes : list for the text.
-    """
-
-    def __init__(self, span_s: float, sigma_s: float, notes: list[str]) -> None:
-        self.sigma_s, self._notes, self._speed_delay_s = sigma_s, notes, span_s / 2
-        self._reported_s = 0.0      # magnitude of the largest reported delay, plus 2 sigma
-        # changes of speed in each of the last three seconds, m/s, by odometer and by force
-        self._recent_changes: deque[tuple[float, float]] = deque(maxlen=3)
-        # rows of the regression: change of acceleration, difference of the changes of speed
-        self._rows: deque[tuple[float, float]] = deque(maxlen=MAX_DELAY_ROWS)
-
-    def add(self, forward_n: Vector, change_n: Floats | None, dv_n: Vector, T: float) -> bool:
-        """
-        Add a second of data; return True if ``sigma_s`` has increased.
-
-        forward_n : forward axis.   change_n : (3,) m/s, change of velocity by the odometer, None
-        if not usable.   dv_n : m/s, integral of the specific force.   T : s.
-        """
-        if change_n is None:
-            self._recent_changes.clear()
-            return False
-        force_n = dv_n - np.array([0.0, 0.0, GRAVITY * T])
-        self._recent_changes.append((float(forward_n @ change_n), float(forward_n @ force_n)))
-        if len(self._recent_changes) < 3:
-            return False
-        (before, _), (by_odometer, by_force), (after, _) = self._recent_changes
-        self._rows.append(((after - before) / 2, by_force - by_odometer))
-        delay, sigma = self._delay()
-        delay += self._speed_delay_s
-        if abs(delay) < max(MIN_DELAY, DELAY_SIGMAS * sigma, self._reported_s):
-            return False
-        self._notes.append(f'IMU stamps are {abs(delay):.2f} s (± {sigma:.2f} s) '
-                           f'{"late" if delay > 0 else "early"} relative to the odometer: add '
-                           f'{-delay:+z.2f} to imu.time_offset; sigma increased')
-        self._reported_s = abs(delay) + 2 * sigma
-        self.sigma_s = max(self.sigma_s, self._reported_s)
-        return True
-
-    def _delay(self) -> tuple[float, float]:
-        """Return the delay of the IMU, s, and its sigma, infinite while there are too few rows."""
-        if len(self._rows) < MIN_DELAY_ROWS:
-            return 0.0, np.inf
-        x, y = np.array(self._rows).T
-        X = np.stack([x, np.ones_like(x)], 1)
-        N = X.T @ X
-        if np.linalg.cond(N) > 1e6:      # no acceleration changes
-            return 0.0, np.inf
-        fit = np.linalg.solve(N, X.T @ y)
-        residuals = y - X @ fit
-        scores = X * residuals[:, None]
-        # residuals are correlated: Newey-West covariance
-        middle = scores.T @ scores
-        for lag in range(1, LAGS):
-            lagged = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)
-            middle += lagged + lagged.T
-        C = np.linalg.inv(N)
-        white_variance = np.sum(residuals**2) / (len(y) - 2) * C[0, 0]
-        variance = max(white_variance, (C @ middle @ C)[0, 0])
-        return float(-fit[0]) / CHANGE_RATIO, float(np.sqrt(variance)) / CHANGE_RATIO

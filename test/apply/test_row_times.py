@@ -9,9 +9,9 @@ from faulty_streams import columns_of, run, started
 import numpy as np
 import pytest
 
+from odocal_ros.apply.delay_search import DelaySearch, MIN_DELAY_ROWS
 from odocal_ros.apply.errors import GRAVITY
 from odocal_ros.apply.row_times import RowTimes
-from odocal_ros.apply.wheels import DelaySearch, MIN_DELAY_ROWS
 from odocal_ros.data.samples import take
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -174,7 +174,7 @@ def test_times_rise_far_from_zero():
 def searched(late, bias=0.1, seconds=200):
     """Search the delay of the force, late in s, with an acceleration of 9 s period."""
     notes = []
-    search = DelaySearch(0.0, 0.01, notes)
+    search = DelaySearch(0.0, 0.01)
 
     def speed(t):
         return 10.0 + 2.0 * np.sin(2 * np.pi * t / 9.0)
@@ -182,8 +182,8 @@ def searched(late, bias=0.1, seconds=200):
     for t in np.arange(1.0, seconds):
         change = [speed(t) - speed(t - 1), 0.0, 0.0]
         force = speed(t - late) - speed(t - 1 - late) + bias
-        search.add(FORWARD, np.array(change), (force, 0.0, GRAVITY), 1.0)
-    return search, notes
+        notes.append(search.add(FORWARD, np.array(change), (force, 0.0, GRAVITY), 1.0))
+    return search, [note for note in notes if note]
 
 
 @pytest.mark.parametrize('late', [0.1, -0.2])
@@ -207,7 +207,7 @@ def test_no_delay_is_reported_without_one_or_from_less_than_a_minute():
     assert not notes
     assert search.sigma_s == 0.01
     assert not searched(0.2, seconds=MIN_DELAY_ROWS)[1]
-    search = DelaySearch(0.0, 0.01, [])
+    search = DelaySearch(0.0, 0.01)
     assert not any(search.add(FORWARD, None, (0.0, 0.0, GRAVITY), 1.0) for _ in range(500))
 
 
