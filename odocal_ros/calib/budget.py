@@ -6,7 +6,7 @@ The error budget of the two-point method: every source as one-sigma effects on t
 
 A leg's end displacement D = M f (M: attitude summed over travel, f: scale times forward axis) is
 set equal to the chord, the vector between the reference positions. A chord error e, m, against D
-changes f by M^-1 e, and so ln K, yaw and pitch; each source is stated as the e of one sigma. An
+changes f by M^-1 e, and so ln K, yaw and pitch; each source is given by its one-sigma e. An
 attitude error phi(t) (computed = (I - [phi x]) true) makes e = sum of phi x dD, and a gyro error
 at time tau rotates the remaining displacement: r(tau) = D(end) - D(tau). Epochs may begin before
 the start mark, at the alignment: D is zero there, gyro errors already accumulate. The Earth
@@ -14,16 +14,15 @@ rotation, which turns an error of one axis into the others by 4 mrad a minute, i
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import Estimate, Source
-from odocal_ros.data.arrays import Floats, map_rows, map_windows
+from odocal_ros.data.arrays import Floats, map_windows
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.geodesy import SEMI_MAJOR_AXIS
 from odocal_ros.nav.rotations import matrix_from_quat, quat_conjugate, quat_multiply, skew
 
@@ -77,9 +76,7 @@ def _gyro_error_effect(r: Floats, q_nb: Floats) -> Floats:
     displacement that remains until the end.
     """
     effect = -skew(r) @ matrix_from_quat(q_nb)
-    mean = effect[:-1] + effect[1:]
-    mean /= 2
-    return mean
+    return np.asarray((effect[:-1] + effect[1:]) / 2)
 
 
 def _step_rotations(q_nb: Floats) -> Floats:
@@ -120,33 +117,40 @@ def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start:
 
 def _velocity(t: Floats, D: Floats, begin: float, end: float) -> Floats:
     """Return the mean velocity between two times, (3,) m/s."""
-    ends = np.stack([np.interp([begin, end], t, D[:, k]) for k in range(3)], -1)
-    return np.asarray((ends[1] - ends[0]) / max(end - begin, 1e-9))
+    ends = np.stack([np.interp([begin, end], t, axis) for axis in D.T], -1)
+    min_duration = 1e-9     # s, shorter than any interval
+    return np.asarray((ends[1] - ends[0]) / max(end - begin, min_duration))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Uncertainties:
+    """Uncertainties of a leg that its marks and its alignment do not contain."""
+
+    fix_scale: Floats           # (3,) factor on the stated sigmas of the fixes, east, north, up
+    quantum: float              # m, size of a count of the odometer
+    time_sigma: float           # s, of the unknown delay of the fixes
+    odometer_time_sigma: float  # s, of that of the odometer
+    lever_arm_sigma: float      # m, of the antenna, each axis
 
 
 def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Floats, q_nb: Floats,
-           alignment: Alignment, *, quantum: float, fix_scale: Floats, time_sigma: float,
-           velocity_change: Floats, lever_arm_sigma: float,
-           odometer_time_sigma: float) -> tuple[Source, ...]:
+           alignment: Alignment, velocity_change: Floats, sigmas: Uncertainties,
+           ) -> tuple[Source, ...]:
     """
     Return the sources of error of (ln K, yaw, pitch): docs/method.md (T9) to (T12).
 
-    ``height`` is the height error common to both marks, which scales the chord as a larger Earth
-    would. ``projection`` is zero, but part of the stored budgets: the chord is in space, not in a
-    plane.
-
     f : (3,) solution, m per unit of travel, in b.   M : (3, 3) attitude summed over travel.
-    start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from alignment
-    or start mark to end mark.   quantum : size of an odometer count, m.   fix_scale : (3,) factor
-    on the stated sigmas, east, north, up.   time_sigma, odometer_time_sigma : unknown delays, s.
-    velocity_change : (3,) velocity at the end mark minus that at the start, m/s; zero between
-    standing marks.   lever_arm_sigma : m, each axis.
+    start, end : reference positions.   t, D, q_nb : (m,) s, (m, 3) m in n, (m, 4), as in
+    drift_sources; epochs from the alignment, or the start mark if that is earlier, to the end
+    mark.   velocity_change : (3,) velocity at the end mark minus that at the start, m/s, in n;
+    zero between standing marks.
     """
     forward = D[-1] / np.linalg.norm(D[-1])
     at_start = int(np.searchsorted(t, start.t - 1e-9))
     # C_first: at the alignment, if that is before the start mark
     C_first, C_start, C_end = matrix_from_quat(q_nb[[0, at_start, -1]])
-    height = start.covariance_n[2, 2] + end.covariance_n[2, 2]
+    height_variance = start.covariance_n[2, 2] + end.covariance_n[2, 2]
+    fix_scale = sigmas.fix_scale
     chord = {
         'fix_start': fix_scale[:, None] * root_of(start.covariance_n),
         'fix_end': fix_scale[:, None] * root_of(end.covariance_n),
@@ -155,22 +159,26 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
         'initial_level': np.stack([np.cross(axis, D[-1]) for axis in C_first.T[:2]], -1)
         * alignment.level_sigma,
         **drift_sources(t, D, q_nb, alignment),
-        'quantisation': (forward * quantum * np.sqrt(2 / 12))[:, None],
-        'fix_latency': (velocity_change * time_sigma)[:, None],
-        'antenna_lever_arm': (C_end - C_start) * lever_arm_sigma,
+        'quantisation': (forward * sigmas.quantum * np.sqrt(2 / 12))[:, None],
+        'fix_latency': (velocity_change * sigmas.time_sigma)[:, None],
+        'antenna_lever_arm': (C_end - C_start) * sigmas.lever_arm_sigma,
         'odometer_delay': (_odometer_delay_effect(f, t, D, q_nb, start, end)
-                           * odometer_time_sigma)[:, None],
-        'height': (D[-1] * (np.sqrt(height / 2) if start.height_known and end.height_known
+                           * sigmas.odometer_time_sigma)[:, None],
+        # the height error common to both marks scales the chord as a larger Earth would
+        'height': (D[-1] * (np.sqrt(height_variance / 2)
+                            if start.height_known and end.height_known
                             else HEIGHT_UNKNOWN) / SEMI_MAJOR_AXIS)[:, None],
+        # zero, as the chord is in space, not in a plane; a key of calibration.json
         'projection': np.zeros((3, 1)),
     }
     gradient = parameter_gradient(f) @ np.linalg.inv(M)
+    # errors that are the same in every leg of a vehicle
     shared = {'fix_latency', 'antenna_lever_arm', 'odometer_delay', 'height', 'initial_level',
               'gyro_scale', 'gyro_axes'}
     if alignment.heading_shared:
         shared.add('initial_heading')
     sources = [Source(name, gradient @ e, name in shared) for name, e in chord.items()]
-    return (*sources, _second_order(t, D, alignment, height * fix_scale[2]**2))
+    return (*sources, _second_order(t, D, alignment, height_variance * fix_scale[2]**2))
 
 
 def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: float) -> Source:
@@ -187,21 +195,6 @@ def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: f
     # the square of one Gaussian: mean m, standard deviation sqrt(2) m, rms sqrt(3) m
     size = 0.5 * np.sqrt(3) * np.linalg.norm([by_bias, by_noise, by_height])
     return Source('second_order', np.array([[size], [0.0], [0.0]]))
-
-
-def epochs_between(track: Track, begin: float, end: float) -> slice:
-    """Return the epochs of a track between two times, s, both included."""
-    return slice(np.searchsorted(track.t, begin), np.searchsorted(track.t, end, side='right'))
-
-
-def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats:
-    """
-    Return the displacement from t_start to the epochs ``rows``, with the solution f: (m, 3) m.
-
-    f : (3,) m per unit of travel, in b.
-    """
-    start = track.at(t_start)
-    return map_rows(lambda P: (P - start) @ f, track.P[rows])
 
 
 def total_covariance(sources: Iterable[Source]) -> Floats:

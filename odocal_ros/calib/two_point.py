@@ -164,9 +164,9 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
     track = chord.track
     # gyro errors accumulate from the alignment, with a fixed heading from the start mark
     first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
-    rows = budget.epochs_between(track, min(first, chord.start.t), chord.end.t)
+    rows = track.rows_between(min(first, chord.start.t), chord.end.t)
     t = track.t[rows]
-    D = budget.displacement(track, rows, chord.start.t, f) * (t >= chord.start.t)[:, None]
+    D = track.displacement(rows, chord.start.t, f) * (t >= chord.start.t)[:, None]
     start, end, M = chord.start, chord.end, chord.M
     if not vertical_known:       # the prior of the pitch replaces the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
@@ -174,11 +174,11 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
         start, end = _with_height_sigma(start, 0.0), _with_height_sigma(end, rise)
     K = float(np.linalg.norm(f))
     return budget.budget(f, M, start, end, t, D, track.q_nb[rows], chord.alignment,
-                         quantum=quantum * K, fix_scale=fix_scale,
-                         time_sigma=config.gnss.time_sigma,
-                         velocity_change=chord.velocity_change @ f,
-                         lever_arm_sigma=config.gnss.lever_arm_sigma,
-                         odometer_time_sigma=config.odometer.time_sigma)
+                         chord.velocity_change @ f, budget.Uncertainties(
+                             fix_scale=fix_scale, quantum=quantum * K,
+                             time_sigma=config.gnss.time_sigma,
+                             odometer_time_sigma=config.odometer.time_sigma,
+                             lever_arm_sigma=config.gnss.lever_arm_sigma))
 
 
 def _travel_sources(chord: Chord, f: Floats) -> tuple[Source, ...]:

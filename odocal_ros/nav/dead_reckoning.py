@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from odocal_ros.data.arrays import chunks, Floats, running_sum, work_array
+from odocal_ros.data.arrays import chunks, Floats, map_rows, running_sum, work_array
 from odocal_ros.nav import geodesy
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
@@ -93,6 +93,19 @@ class Track:
         k = np.clip(np.searchsorted(self.t, t), 1, len(self.t) - 1)
         k = np.where(np.abs(self.t[k - 1] - t) < np.abs(self.t[k] - t), k - 1, k)
         return matrix_from_quat(self.q_nb[k])
+
+    def rows_between(self, begin: float, end: float) -> slice:
+        """Return the epochs between two times, s, both included."""
+        return slice(np.searchsorted(self.t, begin), np.searchsorted(self.t, end, side='right'))
+
+    def displacement(self, rows: slice, t_start: float, f: Floats) -> Floats:
+        """
+        Return the displacement from t_start, s, to the epochs ``rows``: (m, 3) m.
+
+        f : (3,) m per unit of travel, in b.
+        """
+        start = self.at(t_start)
+        return map_rows(lambda P: (P - start) @ f, self.P[rows])
 
 
 def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib import track_check
-from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
+from odocal_ros.calib.budget import drift_sources
 from odocal_ros.calib.drive import fix_white_noise
 from odocal_ros.calib.marks import MarkFix, marks_with_slow_errors
 from odocal_ros.calib.slip import slip_reasons
@@ -155,9 +155,9 @@ class TwoPointRun:
 
     def _drift(self, chord: Chord, f: Floats) -> Floats:
         """Return the bend of a track, fixed at both ends, by gyro errors: (3, k) m, 1 sigma."""
-        keep = epochs_between(self.track, chord.start.t, chord.end.t)
-        D = displacement(self.track, keep, chord.start.t, f)
-        sources = drift_sources(self.track.t[keep], D, self.track.q_nb[keep],
+        rows = self.track.rows_between(chord.start.t, chord.end.t)
+        D = self.track.displacement(rows, chord.start.t, f)
+        sources = drift_sources(self.track.t[rows], D, self.track.q_nb[rows],
                                 self.prepared.alignment)
         # the bow of a track fixed at both ends is a quarter of the drift of a free end
         return np.concatenate(list(sources.values()), axis=1) / 4

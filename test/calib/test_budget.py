@@ -9,7 +9,7 @@ from drives import changed, drive, settings, shifted, two_point
 import numpy as np
 import pytest
 
-from odocal_ros.calib.budget import budget, drift_sources, PARAMETERS
+from odocal_ros.calib.budget import budget, drift_sources, PARAMETERS, Uncertainties
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, forward_b, mounting_from_forward
@@ -74,12 +74,14 @@ def alignment(**figures):
 
 
 def sources(track, *, standing=True, cov=0.0, fix_scale=(1.0, 1.0, 1.0), more=None, **figures):
-    options = {'quantum': 0.0, 'time_sigma': 0.0, 'velocity_change': np.zeros(3),
-               'lever_arm_sigma': 0.0, 'odometer_time_sigma': 0.0} | (more or {})
+    sigmas = {'quantum': 0.0, 'time_sigma': 0.0, 'lever_arm_sigma': 0.0,
+              'odometer_time_sigma': 0.0} | (more or {})
+    velocity_change = sigmas.pop('velocity_change', np.zeros(3))
     marks = [MarkFix(t, np.zeros(3), np.eye(3) * cov, standing, 9)
              for t in (track.t[0], track.t[-1])]
     found = budget(F, track.P[-1], *marks, track.t, track.P @ F, track.q_nb,
-                   alignment(**figures), fix_scale=np.array(fix_scale), **options)
+                   alignment(**figures), velocity_change,
+                   Uncertainties(fix_scale=np.array(fix_scale), **sigmas))
     return {s.name: s for s in found}
 
 
