@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.planar.chain import Equations, Rows, Solution
+from odocal_ros.calib.planar.chain import Equations, normal_equations, Rows, Solution, weighted_sum
 from odocal_ros.calib.planar.first_values import first_values
 from odocal_ros.calib.planar.run import Fit, PriorKnowledge, Run
 from odocal_ros.data.arrays import Floats
@@ -56,7 +56,7 @@ def fit_run(run: Run, knowledge: PriorKnowledge,
     while passes < MAX_PASSES and not converged:
         passes += 1
         rows = _rows(run, knowledge, state, c, first_gains, student_weights)
-        equations = {name: Equations(r, len(state)) for name, r in rows.items()}
+        equations = {name: normal_equations(r, len(state)) for name, r in rows.items()}
         solution = _solve(equations, levels, prior, np.einsum('ij,j->i', prior, c - prior_mean))
         residuals = {name: replace(r, value=_residuals_after_step(r, solution))
                      for name, r in rows.items()}
@@ -91,7 +91,7 @@ def fit_at(run: Run, knowledge: PriorKnowledge, state: Floats, c: Floats, levels
     student_weights = {name: weight * (STUDENT_FREEDOM + 2) / (STUDENT_FREEDOM + 4) / weight.mean()
                        for name, weight in (student_weights or even).items()}
     rows = _rows(run, knowledge, state, c, first_gains, student_weights)
-    equations = {name: Equations(r, len(state)) for name, r in rows.items()}
+    equations = {name: normal_equations(r, len(state)) for name, r in rows.items()}
     solution = _solve(equations, levels, prior, 0 * c)
     names = (*run.wheels.names, 'ahead', 'left_of', 'delay',
              *(('gyro_scale', 'gyro_bias') if len(run.gyro) else ()))
@@ -122,7 +122,7 @@ def noise_path(run: Run, scale: float) -> Floats:
 def _solve(equations: dict[str, Equations], levels: dict[str, float], prior: Floats,
            prior_gradient: Floats) -> Solution:
     weight = np.array([1 / levels[name] for name in equations])
-    return Solution(list(equations.values()), weight, prior, prior_gradient)
+    return Solution(weighted_sum(equations.values(), weight), prior, prior_gradient)
 
 
 def _residuals_after_step(rows: Rows, solution: Solution) -> Floats:
@@ -139,11 +139,11 @@ def _level_steps(equations: dict[str, Equations], residuals: dict[str, Rows],
     """Return steps of the logarithms of the levels to their most likely values, by Newton."""
     # the degrees of freedom that the unknowns take from a level are the derivative of the log
     # determinant by the logarithm of its weight
-    steps, h, log_determinant = {}, 1e-3, solution.log_determinant()
+    steps, h, log_determinant = {}, 1e-3, solution.log_determinant
     for name in ESTIMATED:
         other = _solve(equations, levels | {name: levels[name] * np.exp(-h)}, prior, 0 * prior[0])
-        freedom = residuals[name].count - (other.log_determinant() - log_determinant) / h
-        chi2 = residuals[name].square() / levels[name]
+        freedom = residuals[name].count - (other.log_determinant - log_determinant) / h
+        chi2 = residuals[name].weighted_square_sum() / levels[name]
         hyperprior_sigma = HYPERPRIOR_SIGMAS.get(name, WIDE_HYPERPRIOR)
         prior_slope = np.log(LEVELS[name] / levels[name]) / hyperprior_sigma**2
         step = ((chi2 - freedom) / 2 + prior_slope) / (
