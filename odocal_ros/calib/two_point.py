@@ -9,10 +9,12 @@ The same similarity is solved here in the Earth-fixed Cartesian frame n, where t
 exactly similar. With M the attitude summed over travel and c the chord, the vector between the
 reference positions of the marks, M f = c gives f = K forward_b: the scale K times the forward axis
 in b, which is scale, yaw and pitch at once. The plane and the geodesic are the cross-check.
+Frames n, b and v: ``odocal_ros/__init__.py``.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -43,10 +45,11 @@ PITCH_PRIOR = 0.05
 PITCH_LIMIT = 0.26
 # judgement: of the path length; on a shorter chord the errors of its ends dominate
 MIN_CHORD_SHARE = 0.2
+CHECKED_NOMINAL = 0.5, 2.0     # judgement: nominal over estimated scale in the cross-check
 
 
 @dataclass(frozen=True, eq=False)
-class Chord:
+class TwoPointInput:
     """Input of the two-point method."""
 
     track: Track
@@ -67,40 +70,59 @@ class Chord:
         return self.track.at(self.end.t) - self.track.at(self.start.t)
 
 
-def solve(chord: Chord, up_scale: float = 1.0, limit: float = PITCH_LIMIT) -> tuple[Floats, bool]:
+def solve(inputs: TwoPointInput, up_scale: float = 1.0) -> tuple[Floats, Reason | None]:
     """
-    Return f of M f = c, (3,) m per unit of travel, and True if the pitch is known: (T3), (T4).
+    Return f of M f = c, (3,) m per unit of travel: (T3), (T4).
 
-    up_scale : factor on the stated height sigmas; np.inf: heights are not used.   limit : rad;
-    heights that give a larger pitch are not used. Without information from heights, the pitch is
-    zero.
+    Without usable heights the pitch is zero, and the reason is returned.   up_scale : factor on
+    the stated height sigmas.
     """
-    M = chord.M
-    turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)
-    antenna = chord.end.position_n - chord.start.position_n
-    sigma = np.sqrt(chord.start.covariance_n[2, 2] + chord.end.covariance_n[2, 2])
-    vertical_known = bool(chord.start.height_known and chord.end.height_known
-                          and up_scale < np.inf
-                          and up_scale * sigma < PITCH_PRIOR * np.hypot(*antenna[:2]))
+    height_sigma = np.sqrt(inputs.start.covariance_n[2, 2] + inputs.end.covariance_n[2, 2])
+    horizontal = np.hypot(*(inputs.end.position_n - inputs.start.position_n)[:2])
+    cause = 'are unknown'
+    if inputs.start.height_known and inputs.end.height_known:
+        cause = 'are too inaccurate for the pitch'
+        if up_scale * height_sigma < PITCH_PRIOR * horizontal:
+            f = _solved(inputs, True)
+            if abs(np.arctan2(f[2], np.hypot(f[0], f[1]))) <= PITCH_LIMIT:
+                return f, None
+            _, pitch = mounting_from_forward(f / np.linalg.norm(f))
+            return solve_level(inputs), Reason(
+                Code.TRACK_MISMATCH, 'the heights of the marks give a pitch of '
+                f'{np.rad2deg(float(pitch)):+z.0f} deg; the limit is '
+                f'{np.rad2deg(PITCH_LIMIT):.0f} deg', 'Set imu.mounting_rpy to the approximate '
+                'pitch of the IMU, or check the heights and their unit.')
+    return solve_level(inputs), Reason(
+        Code.PITCH_NOT_DETERMINED, f'the heights of the marks {cause}; '
+        f'0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is assumed')
+
+
+def solve_level(inputs: TwoPointInput) -> Floats:
+    """Return f as ``solve``, with a pitch of zero and without the heights."""
+    return _solved(inputs, False)
+
+
+def _solved(inputs: TwoPointInput, with_heights: bool) -> Floats:
+    M = inputs.M
+    attitude_change = inputs.track.C_nb_at(inputs.end.t) - inputs.track.C_nb_at(inputs.start.t)
+    antenna = inputs.end.position_n - inputs.start.position_n
     f = np.array([1.0, 0.0, 0.0])
-    for _ in range(4):      # the lever arm turns with the mounting angles: converges at once
-        c = antenna - turn @ axes_from_forward(f) @ chord.lever_v
-        if vertical_known:
-            f = np.linalg.solve(M, c)
-            if abs(np.arctan2(f[2], np.hypot(f[0], f[1]))) > limit:
-                return solve(chord, np.inf)
-        else:
-            f = np.append(np.linalg.solve(M[:2, :2], c[:2]), 0.0)
-    return f, vertical_known
+    # the lever arm turns with the mounting angles: each pass reduces the error by its ratio to
+    # the chord, usually below 1 %
+    for _ in range(4):
+        c = antenna - attitude_change @ axes_from_forward(f) @ inputs.lever_v
+        f = (np.linalg.solve(M, c) if with_heights
+             else np.append(np.linalg.solve(M[:2, :2], c[:2]), 0.0))
+    return f
 
 
-def refusal_reasons(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
+def refusal_reasons(inputs: TwoPointInput, scale_guess: float) -> tuple[Reason, ...]:
     """Return the reason against the method if the chord is short; scale_guess: m per unit."""
-    inside = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
-    path = np.abs(np.diff(chord.track.s[inside])).sum() * scale_guess
-    length = np.hypot(*(chord.end.position_n - chord.start.position_n)[:2])
-    # the length of the track's own chord, independent of yaw: M is a rotation times it
-    reckoned = np.sqrt(abs(np.linalg.det(chord.M[:2, :2]))) * scale_guess
+    inside = (inputs.track.t >= inputs.start.t) & (inputs.track.t <= inputs.end.t)
+    path = np.abs(np.diff(inputs.track.s[inside])).sum() * scale_guess
+    length = np.hypot(*(inputs.end.position_n - inputs.start.position_n)[:2])
+    # |det M|^(1/2) is the chord length of the track per unit of scale, for any yaw
+    reckoned = np.sqrt(abs(np.linalg.det(inputs.M[:2, :2]))) * scale_guess
     for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
         if chord_length <= MIN_CHORD_SHARE * path:
             return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
@@ -119,78 +141,81 @@ def refused_result(reasons: Iterable[Reason], scale_unit: str) -> MethodResult:
     return MethodResult('two_point', tuple(reasons), _unknown(scale_unit), budget.PARAMETERS)
 
 
-def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix_scale: Floats,
-        config: Config) -> MethodResult:
+def fit(inputs: TwoPointInput, nominal_scale: float, scale_unit: str, quantum: float,
+        fix_scale: Floats, config: Config) -> MethodResult:
     """
     Return scale, yaw and pitch of one leg with their sigmas and the error budget.
 
-    chord : track, marks and alignment of the leg.   nominal_scale : K0, 0 where unknown.
+    inputs : track, marks and alignment of the leg.   nominal_scale : K0, 0 where unknown.
     quantum : size of a count in scale units, 0 for speeds.   fix_scale : (3,) factor on the stated
     fix sigmas, east, north, up.   config : limits.
     """
-    f, vertical_known = solve(chord, fix_scale[2])
-    sources = (*_sources(chord, f, vertical_known, quantum, fix_scale, config),
-               *_travel_sources(chord, f))
+    f, pitch_reason = solve(inputs, fix_scale[2])
+    sources = (*_sources(inputs, f, pitch_reason is None, quantum, fix_scale, config),
+               *_travel_sources(inputs, f))
     covariance = budget.total_covariance(sources)
     sigma = np.sqrt(np.diag(covariance))
     K = float(np.linalg.norm(f))
     yaw, pitch = (float(a) for a in mounting_from_forward(f / K))
-    reasons = _yaw_reasons(chord.alignment, yaw, sources, config)
-    reasons += () if vertical_known else (_without_heights(chord, fix_scale[2]),)
+    reasons, yaw_known = _yaw_reasons(inputs.alignment, yaw, sources, config)
+    reasons += (pitch_reason,) if pitch_reason else ()
     estimates = _unknown(scale_unit)
     estimates['scale_factor'] = Estimate(K, K * float(sigma[0]), scale_unit)
     if nominal_scale:
         ratio = K / nominal_scale
         estimates['scale_ratio'] = Estimate(ratio, ratio * float(sigma[0]), '1')
-    if Code.YAW_NOT_SEPARABLE not in {r.code for r in reasons}:
+    if yaw_known:
         estimates['yaw_mounting_angle'] = Estimate(yaw, float(sigma[1]), 'rad')
-    if vertical_known:
+    if pitch_reason is None:
         estimates['pitch_mounting_angle'] = Estimate(pitch, float(sigma[2]), 'rad')
-    if chord.alignment.standstill is not None:
-        for axis, bias, bias_sigma in zip('xyz', chord.alignment.gyro_bias,
-                                          chord.alignment.gyro_bias_sigma, strict=True):
+    if inputs.alignment.standstill is not None:
+        for axis, bias, bias_sigma in zip('xyz', inputs.alignment.gyro_bias,
+                                          inputs.alignment.gyro_bias_sigma, strict=True):
             estimates[f'gyro_bias_{axis}'] = Estimate(float(bias), float(bias_sigma), 'rad/s')
-    check = _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0 else K, config)
+    # of a scale that is far off, the chords would differ too much for a comparison
+    lowest, highest = CHECKED_NOMINAL
+    check = _cross_check(inputs, f, nominal_scale if lowest < nominal_scale / K < highest else K,
+                         config)
     reasons += _plane_reasons(check, K, sigma[0])
     return MethodResult('two_point', reasons, estimates, budget.PARAMETERS, sources, {
         'budget': budget.budget_table(sources, budget.PARAMETERS, (K, 1.0, 1.0)),
         'correlation': budget.correlations(covariance, budget.PARAMETERS), 'cross_check': check,
-        'heading_source': chord.alignment.heading_source, 'f': f})
+        'heading_source': inputs.alignment.heading_source, 'f': f})
 
 
-def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_scale: Floats,
-             config: Config) -> tuple[Source, ...]:
+def _sources(inputs: TwoPointInput, f: Floats, vertical_known: bool, quantum: float,
+             fix_scale: Floats, config: Config) -> tuple[Source, ...]:
     """Return the error sources but those of lost travel and slip; arguments as for ``fit``."""
-    track = chord.track
+    track = inputs.track
     # gyro errors accumulate from the alignment, with a fixed heading from the start mark
-    first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
-    rows = track.rows_between(min(first, chord.start.t), chord.end.t)
+    first = inputs.start.t if inputs.alignment.heading_source == 'fixed' else inputs.alignment.t
+    rows = track.rows_between(min(first, inputs.start.t), inputs.end.t)
     t = track.t[rows]
-    D = track.displacement(rows, chord.start.t, f) * (t >= chord.start.t)[:, None]
-    start, end, M = chord.start, chord.end, chord.M
+    D = track.displacement(rows, inputs.start.t, f) * (t >= inputs.start.t)[:, None]
+    start, end, M = inputs.start, inputs.end, inputs.M
     if not vertical_known:       # the prior of the pitch replaces the heights
-        fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
+        fix_scale = np.append(fix_scale[:2], 1.0)
         rise = PITCH_PRIOR * float(np.linalg.norm(M @ f))
         start, end = _with_height_sigma(start, 0.0), _with_height_sigma(end, rise)
     K = float(np.linalg.norm(f))
-    return budget.budget(f, M, start, end, t, D, track.q_nb[rows], chord.alignment,
-                         chord.velocity_change @ f, budget.Uncertainties(
+    return budget.budget(f, M, start, end, t, D, track.q_nb[rows], inputs.alignment,
+                         inputs.velocity_change @ f, budget.Uncertainties(
                              fix_scale=fix_scale, quantum=quantum * K,
                              time_sigma=config.gnss.time_sigma,
                              odometer_time_sigma=config.odometer.time_sigma,
                              lever_arm_sigma=config.gnss.lever_arm_sigma))
 
 
-def _travel_sources(chord: Chord, f: Floats) -> tuple[Source, ...]:
+def _travel_sources(inputs: TwoPointInput, f: Floats) -> tuple[Source, ...]:
     """Return the sources of travel lost in gaps and resets, and of slip; empty if none."""
-    gradient = budget.parameter_gradient(f) @ np.linalg.inv(chord.M)
+    gradient = budget.parameter_gradient(f) @ np.linalg.inv(inputs.M)
     sources: tuple[Source, ...] = ()
-    if len(chord.slips[0]):
-        sources += (slip_source(chord.track, f, gradient, *chord.slips),)
-    t, sigma = chord.lost_travel
-    inside = (t >= chord.start.t) & (t <= chord.end.t) & (sigma > 0)
+    if len(inputs.slips[0]):
+        sources += (slip_source(inputs.track, f, gradient, *inputs.slips),)
+    t, sigma = inputs.lost_travel
+    inside = (t >= inputs.start.t) & (t <= inputs.end.t) & (sigma > 0)
     if inside.any():
-        along_n = chord.track.C_nb_at(t[inside]) @ f * sigma[inside, None]      # (k, 3) m
+        along_n = inputs.track.C_nb_at(t[inside]) @ f * sigma[inside, None]      # (k, 3) m
         sources += (Source('odometer_gaps', gradient @ along_n.T),)
     return sources
 
@@ -203,24 +228,9 @@ def _with_height_sigma(mark: MarkFix, sigma: float) -> MarkFix:
     return replace(mark, covariance_n=covariance)
 
 
-def _without_heights(chord: Chord, up_scale: float) -> Reason:
-    """Return the reason for a pitch that the heights do not determine."""
-    f, known = solve(chord, up_scale, np.inf)
-    if known:
-        _, pitch = mounting_from_forward(f / np.linalg.norm(f))
-        return Reason(Code.TRACK_MISMATCH, 'the heights of the marks give a pitch of '
-                      f'{np.rad2deg(float(pitch)):+z.0f} deg; the limit is '
-                      f'{np.rad2deg(PITCH_LIMIT):.0f} deg', 'Set imu.mounting_rpy to the '
-                      'approximate pitch of the IMU, or check the heights and their unit.')
-    cause = ('are too inaccurate for the pitch' if chord.start.height_known
-             and chord.end.height_known else 'are unknown')
-    return Reason(Code.PITCH_NOT_DETERMINED, f'the heights of the marks {cause}; '
-                  f'0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is assumed')
-
-
 def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
-                 config: Config) -> tuple[Reason, ...]:
-    """Return the reasons about yaw (rad), from the heading."""
+                 config: Config) -> tuple[tuple[Reason, ...], bool]:
+    """Return the reasons about yaw (rad), from the heading, and True if it is separable."""
     limit = config.verdict.max_yaw_sigma
     by_heading = next(s for s in sources if s.name == 'initial_heading')
     heading_sigma = float(np.linalg.norm(by_heading.effects[1]))
@@ -244,26 +254,27 @@ def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
                            f'course give a yaw mounting of {np.rad2deg(yaw):+z.1f} deg, '
                            f'{np.rad2deg(deviation):.1f} deg from its nominal value; the limit is '
                            f'{np.rad2deg(FAR_YAW):.0f} deg'),)
-    return reasons
+    return reasons, alignment.heading_separable and heading_sigma <= limit
 
 
-def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
+def _cross_check(inputs: TwoPointInput, f: Floats, nominal_scale: float,
                  config: Config) -> dict[str, dict[str, float]]:
     """Return K and yaw by eq. (6)-(10) of Shi et al. in the plane and by the geodesic: (T14)."""
     # the track has nominal_scale, yaw 0 and the estimated pitch, and begins at the start mark.
     # As in the paper, o is the start, b the end by the fixes, b_dr the end of the track
     K = np.linalg.norm(f)
     _, pitch = map(float, mounting_from_forward(f / K))
-    turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)
-    start_n = chord.start.position_n
-    end_n = chord.end.position_n - turn @ axes_from_forward(f) @ chord.lever_v
-    reckoned_n = start_n + nominal_scale * chord.M @ forward_b(0.0, pitch)
-    o, b, b_dr = (chord.origin.to_geodetic(p) for p in (start_n, end_n, reckoned_n))
+    attitude_change = inputs.track.C_nb_at(inputs.end.t) - inputs.track.C_nb_at(inputs.start.t)
+    start_n = inputs.start.position_n
+    end_n = inputs.end.position_n - attitude_change @ axes_from_forward(f) @ inputs.lever_v
+    reckoned_n = start_n + nominal_scale * inputs.M @ forward_b(0.0, pitch)
+    o, b, b_dr = (inputs.origin.to_geodetic(p) for p in (start_n, end_n, reckoned_n))
     plane = plane_for(config.projection, o[1] + wrap(b[1] - o[1]) / 2)
     results = {}
-    for name, length in (('plane', lambda p, q: plane_chord(plane, p, q)),
-                         ('geodesic', geodesic_chord)):
-        (s1, bearing), (s2, bearing_dr) = length(o, b), length(o, b_dr)
+    chords: dict[str, Callable[[Floats, Floats], tuple[float, float]]] = {
+        'plane': partial(plane_chord, plane), 'geodesic': geodesic_chord}
+    for name, chord_of in chords.items():
+        (s1, bearing), (s2, bearing_dr) = chord_of(o, b), chord_of(o, b_dr)
         results[name] = {'S1': s1, 'S2': s2, 'scale_factor': float(nominal_scale * s1 / s2),
                          'alpha_psi': float(wrap(bearing - bearing_dr))}
     return results
@@ -273,7 +284,8 @@ def _plane_reasons(check: dict[str, dict[str, float]], K: float,
                    sigma_relative: float) -> tuple[Reason, ...]:
     """Return PLANES_DISAGREE if the ratio of chords differs from the estimated scale."""
     worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
-    # relative: a plane about the leg preserves ratios of chords far better
+    # relative: a plane about the leg preserves ratios of chords far better; a deviation below a
+    # fifth of the sigma has no effect. Judgement
     limit = 3e-5 + 0.2 * sigma_relative
     if worst > limit:
         return (Reason(Code.PLANES_DISAGREE, 'the scale from the straight-line distance between '

@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.calib.drive import check_drive
 from odocal_ros.calib.marks import MARK_WINDOW, MarkFix, mean_fix, standing_at
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.two_point import Chord, fit, refusal_reasons, refused_result
+from odocal_ros.calib.two_point import fit, refusal_reasons, refused_result, TwoPointInput
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig, BadUsage
@@ -127,14 +127,15 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     track = Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
     start, end = (_expected_mark(t, track, drive, sigmas, spans, limit) for t, limit in (
         (0.0, config.reference.start), (drive.duration, config.reference.end)))
-    chord = Chord(track, Origin(drive.latitude, drive.longitude, drive.height), start, end,
-                  np.zeros(3), _velocity_change(track, (start, end)), alignment)
+    two_point = TwoPointInput(
+        track, Origin(drive.latitude, drive.longitude, drive.height), start, end, np.zeros(3),
+        _velocity_change(track, (start, end)), alignment)
     reasons = (*alignment_reasons, *drive_reasons)
-    refused = refusal_reasons(chord, 1.0)
+    refused = refusal_reasons(two_point, 1.0)
     if refused:
         method = refused_result(refused, '1')
     else:
-        method = fit(chord, 1.0, '1', sigmas.quantum, np.ones(3), config)
+        method = fit(two_point, 1.0, '1', sigmas.quantum, np.ones(3), config)
         reasons += check_limits(method.estimates, 1.0, config)
     return Prediction(method, reasons + method.reasons, alignment, distance,
                       float(np.linalg.norm((end.position_n - start.position_n)[:2])),

@@ -13,7 +13,14 @@ from odocal_ros.calib.budget import drift_sources
 from odocal_ros.calib.drive import fix_white_noise
 from odocal_ros.calib.marks import MarkFix, marks_with_slow_errors
 from odocal_ros.calib.slip import slip_reasons
-from odocal_ros.calib.two_point import Chord, fit, refusal_reasons, refused_result, solve
+from odocal_ros.calib.two_point import (
+    fit,
+    refusal_reasons,
+    refused_result,
+    solve,
+    solve_level,
+    TwoPointInput,
+)
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.pipeline.prepared_leg import (
@@ -51,26 +58,27 @@ class TwoPointRun:
 
     def result(self) -> MethodRun:
         """Return the method's result, the paths before and after, and the reasons."""
-        chord = self._chord()
-        refused = tuple(self.reasons) if chord is None else refusal_reasons(
-            chord, self.prepared.rough_scale)
-        if chord is None or refused:
+        two_point = self._input()
+        refused = tuple(self.reasons) if two_point is None else refusal_reasons(
+            two_point, self.prepared.rough_scale)
+        if two_point is None or refused:
             return MethodRun(refused_result(refused, self.inputs.scale_unit),
                              data_reasons=tuple(self.data_reasons))
-        f, _ = solve(chord, up_scale=np.inf)
+        f = solve_level(two_point)
         t_fix = self.inputs.t_fix
-        between = (t_fix >= chord.start.t) & (t_fix <= chord.end.t)
+        between = (t_fix >= two_point.start.t) & (t_fix <= two_point.end.t)
         inside, outlier_reasons = without_outliers(self.prepared, self.prepared.path(f),
-                                                   chord.start, between)
+                                                   two_point.start, between)
         between &= inside
         self.data_reasons += outlier_reasons
         factor = np.ones(3)
         if between.sum() >= 3:
-            chord, factor = self._fit_noise(chord, f, between)
-        chord = replace(chord, slips=self._find_slips(chord, solve(chord, up_scale=factor[2])[0]))
-        method = fit(chord, self.prepared.nominal_scale, self.inputs.scale_unit,
+            two_point, factor = self._fit_noise(two_point, f, between)
+        f, _ = solve(two_point, up_scale=factor[2])
+        two_point = replace(two_point, slips=self._find_slips(two_point, f))
+        method = fit(two_point, self.prepared.nominal_scale, self.inputs.scale_unit,
                      self.inputs.travel.quantum, factor, self.config)
-        self._check_counting_direction(chord)
+        self._check_counting_direction(two_point)
         method = replace(method, reasons=(*method.reasons, *self.reasons, *check_limits(
             method.estimates, self.prepared.nominal_scale, self.config)))
         f = method.details['f']
@@ -79,11 +87,11 @@ class TwoPointRun:
         return MethodRun(method, paths, tuple(self.data_reasons),
                          odometer_reasons=self.slip_reasons)
 
-    def _find_slips(self, chord: Chord, f: Floats) -> tuple[Floats, Floats]:
+    def _find_slips(self, two_point: TwoPointInput, f: Floats) -> tuple[Floats, Floats]:
         """Return times, s, and sizes, m, of slips of the mean wheel; set ``slip_reasons``."""
         if not self.inputs.has_accelerometer:
             return np.empty(0), np.empty(0)
-        ends = chord.start.t, chord.end.t
+        ends = two_point.start.t, two_point.end.t
         forward = corrected_forward_axis(self.prepared.imu_orientation, f)
         slips = slip_check(self.prepared, self.track, forward, ends)
         self.slip_reasons = slip_reasons(slips, self.config.odometer.time_offset)
@@ -92,8 +100,8 @@ class TwoPointRun:
         return (np.append(slips.t, of_wheel.t[inside]),
                 np.append(slips.size, of_wheel.size[inside] / of_wheel.count))
 
-    def _chord(self) -> Chord | None:
-        """Return the chord between the marks; None, with a reason, without fixes."""
+    def _input(self) -> TwoPointInput | None:
+        """Return track and marks; None, with a reason, without fixes."""
         prepared, track = self.prepared, self.track
         path = prepared.path(np.array([prepared.rough_scale, 0.0, 0.0]))
         start = prepared.mark(prepared.time_span[0], path, 'start')
@@ -102,15 +110,16 @@ class TwoPointRun:
                          for name, mark in (('start', start), ('end', end)) if mark is None]
         if start is None or end is None:
             return None
-        chord = Chord(track, prepared.origin, start, end, prepared.lever_v,
-                      self._velocity_change((start, end)), prepared.alignment,
-                      (self.inputs.uncertain_t, self.inputs.uncertain_sigma))
+        two_point = TwoPointInput(
+            track, prepared.origin, start, end, prepared.lever_v,
+            self._velocity_change((start, end)), prepared.alignment,
+            (self.inputs.uncertain_t, self.inputs.uncertain_sigma))
         exact = all(m.standing or m.surveyed for m in (start, end))
-        if exact or refusal_reasons(chord, prepared.rough_scale):
-            return chord
+        if exact or refusal_reasons(two_point, prepared.rough_scale):
+            return two_point
         # marks in motion depend on the solution
-        path = prepared.path(solve(chord, up_scale=np.inf)[0])
-        return replace(chord, start=prepared.mark(start.t, path, 'start') or start,
+        path = prepared.path(solve_level(two_point))
+        return replace(two_point, start=prepared.mark(start.t, path, 'start') or start,
                        end=prepared.mark(end.t, path, 'end') or end)
 
     def _velocity_change(self, marks: Sequence[MarkFix]) -> Floats:
@@ -124,18 +133,20 @@ class TwoPointRun:
                     high - low, 1e-6)
         return change
 
-    def _fit_noise(self, chord: Chord, f: Floats, between: Bools) -> tuple[Chord, Floats]:
-        """Return the chord with realistic marks, the factor on fix sigmas; check the track."""
+    def _fit_noise(self, two_point: TwoPointInput, f: Floats,
+                   between: Bools) -> tuple[TwoPointInput, Floats]:
+        """Return the input with realistic marks, the factor on fix sigmas; check the track."""
         prepared = self.prepared
         fixes = self.inputs.t_fix[between], prepared.fixes_n[between]
-        drift_n = self._drift(chord, f)
+        drift_n = self._drift(two_point, f)
         drift = float(np.linalg.norm(drift_n))
-        residual = track_check.track_residuals(prepared.path(f), chord.start, fixes)
-        up = track_check.track_residuals(prepared.path(solve(chord)[0]), chord.start, fixes)
+        residual = track_check.track_residuals(prepared.path(f), two_point.start, fixes)
+        up = track_check.track_residuals(prepared.path(solve(two_point)[0]), two_point.start,
+                                         fixes)
         residual[:, 2] = up[:, 2]              # without the error of the pitch
         covariance = self.inputs.covariance_n[between]
         factor = track_check.fix_noise_factor(residual, covariance, drift,
-                                              (chord.start, chord.end))
+                                              (two_point.start, two_point.end))
         if factor.max() > 1.0:
             distance_rms = float(np.sqrt((residual[:, :2]**2).sum(axis=1).mean()))
             self.reasons.append(Reason(
@@ -146,24 +157,25 @@ class TwoPointRun:
                 'both, or a shorter leg. Uncertainties were increased to match the residuals.'))
         if np.isnan(self.config.gnss.correlation_time):     # else configured
             start, end = marks_with_slow_errors(
-                (chord.start, chord.end), prepared.spans, fixes[0], self.track.at(fixes[0]) @ f,
-                chord.M @ f, residual / factor[0], covariance, drift_n / factor[0])
-            chord = replace(chord, start=start, end=end)
-        f, _ = solve(chord, up_scale=factor[2])
-        self._check_track(chord, f, fixes, residual, drift)
-        return chord, factor
+                (two_point.start, two_point.end), prepared.spans, fixes[0],
+                self.track.at(fixes[0]) @ f, two_point.M @ f, residual / factor[0], covariance,
+                drift_n / factor[0])
+            two_point = replace(two_point, start=start, end=end)
+        f, _ = solve(two_point, up_scale=factor[2])
+        self._check_track(two_point, f, fixes, residual, drift)
+        return two_point, factor
 
-    def _drift(self, chord: Chord, f: Floats) -> Floats:
+    def _drift(self, two_point: TwoPointInput, f: Floats) -> Floats:
         """Return the bend of a track, fixed at both ends, by gyro errors: (3, k) m, 1 sigma."""
-        rows = self.track.rows_between(chord.start.t, chord.end.t)
-        D = self.track.displacement(rows, chord.start.t, f)
+        rows = self.track.rows_between(two_point.start.t, two_point.end.t)
+        D = self.track.displacement(rows, two_point.start.t, f)
         sources = drift_sources(self.track.t[rows], D, self.track.q_nb[rows],
                                 self.prepared.alignment)
         # the bow of a track fixed at both ends is a quarter of the drift of a free end
         return np.concatenate(list(sources.values()), axis=1) / 4
 
-    def _check_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
-                     drift: float) -> None:
+    def _check_track(self, two_point: TwoPointInput, f: Floats, fixes: tuple[Floats, Floats],
+                     residual: Floats, drift: float) -> None:
         """Collect the reasons against the track: reversing, distance from the fixes, bend."""
         prepared, (t, p) = self.prepared, fixes
         # track errors count as noise
@@ -173,18 +185,18 @@ class TwoPointRun:
         reversals = track_check.reversal_reasons(pieces, self.config.odometer.signed)
         self.data_reasons += reversals
         if not reversals:
-            residuals = track_check.track_residuals(prepared.path(f), chord.start, fixes)
+            residuals = track_check.track_residuals(prepared.path(f), two_point.start, fixes)
             statistics = track_check.track_statistics(residuals, prepared.distance)
             self.reasons += track_check.distance_reasons(
                 statistics, prepared.fix_sigma, drift, prepared.distance
-            ) or track_check.bend_reasons(t, residuals, chord.M @ f, prepared.fix_sigma, drift,
+            ) or track_check.bend_reasons(t, residuals, two_point.M @ f, prepared.fix_sigma, drift,
                                           prepared.distance)
 
-    def _check_counting_direction(self, chord: Chord) -> None:
+    def _check_counting_direction(self, two_point: TwoPointInput) -> None:
         """Add the reason for an odometer that counts down without a known IMU orientation."""
         counts_down = self.track.s[-1] < self.track.s[0]
         if (counts_down and self.prepared.imu_orientation is None
-                and not chord.alignment.heading_separable):
+                and not two_point.alignment.heading_separable):
             self.data_reasons.append(Reason(
                 Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive counts '
                 'mean reverse motion, or the vehicle reversed during the whole leg'))
