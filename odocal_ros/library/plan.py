@@ -19,7 +19,7 @@ from odocal_ros.forecast import planned_drive
 from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
 from odocal_ros.forecast.planned_methods import keyframe_spacing, Plan, plan_methods
 from odocal_ros.forecast.predict import predict, Sigmas
-from odocal_ros.library import planned_drives
+from odocal_ros.library import drive_sources
 from odocal_ros.library.arguments import config_of, Settings
 from odocal_ros.output.value_text import duration_text, length_text
 from odocal_ros.pipeline.combination import combine_results
@@ -27,6 +27,7 @@ from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW, _ = PARAMETERS
 RTK_SIGMA = 0.02                  # m, physical: of a fix, by receivers' data sheets
+DEFAULT_REST = 30.0               # s, judgement: standstill at a mark, if not given
 
 
 @dataclass(frozen=True)
@@ -49,39 +50,35 @@ def tested_changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Te
     # with the keyframe spacing of this drive: a wider one alone makes a sigma larger
     spacing = keyframe_spacing(drive)
     results = []
-    for text, other_drive, other_sigmas in (*_other_drives(drive, sigmas, before),
-                                            *_better_sensors(drive, sigmas, before)):
+    variants = [(text, other, sigmas) for text, other in _other_drives(drive, sigmas, before)]
+    variants += [(text, drive, better) for text, better in _better_sensors(sigmas, before)]
+    for text, other_drive, other_sigmas in variants:
         after = plan_methods(other_drive, other_sigmas, spacing)
         results.append(TestedChange(text, {name: after.sigma(name) for name in (SCALE, YAW)}))
     return results + _second_leg(drive, sigmas, before)
 
 
 def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
-                  before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
-    """Yield (text, drive, sigmas) of drives that are longer or have more manoeuvres."""
-    yield (f'{length_text(drive.distance)} more, straight ahead', drive.lengthen(drive.distance),
-           sigmas)
+                  before: Plan) -> Iterator[tuple[str, PlannedDrive]]:
+    """Yield (text, drive) of drives that are longer or have more manoeuvres."""
+    yield f'{length_text(drive.distance)} more, straight ahead', drive.lengthen(drive.distance)
     min_rest = 60.0    # s
     rest = max(min_rest, *before.two_point.standing)
-    yield (f'standing {duration_text(rest)} longer at both marks',
-           drive.lengthen_rests(rest), sigmas)
-    yield 'one more stop and start', planned_drive.add_stop_and_start(drive), sigmas
-    yield 'one more left turn and right turn', planned_drive.add_left_and_right_turns(
-        drive), sigmas
+    yield f'standing {duration_text(rest)} longer at both marks', drive.lengthen_rests(rest)
+    yield 'one more stop and start', planned_drive.add_stop_and_start(drive)
+    yield 'one more left turn and right turn', planned_drive.add_left_and_right_turns(drive)
     town_minutes = 5
     yield (f'{town_minutes} min more, stop and go with turns',
-           planned_drive.add_town_driving(drive, town_minutes), sigmas)
+           planned_drive.add_town_driving(drive, town_minutes))
     farthest = _until_farthest(drive, sigmas)
     if farthest is not None:
-        yield (f'end mark at the farthest point ({length_text(farthest.distance)})',
-               farthest, sigmas)
+        yield f'end mark at the farthest point ({length_text(farthest.distance)})', farthest
 
 
-def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
-                    before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
-    """Yield (text, drive, sigmas) with better fixes, heading and IMU."""
+def _better_sensors(sigmas: Sigmas, before: Plan) -> Iterator[tuple[str, Sigmas]]:
+    """Yield (text, sigmas) with better fixes, heading and IMU."""
     if sigmas.fix > 2 * RTK_SIGMA:
-        yield (f'RTK fixes ({RTK_SIGMA:g} m)', drive,
+        yield (f'RTK fixes ({RTK_SIGMA:g} m)',
                replace(sigmas, fix=RTK_SIGMA, fix_up=2 * RTK_SIGMA))
     alignment = before.two_point.alignment
     heading_sigma = alignment.heading_sigma if alignment.heading_separable else math.inf
@@ -89,26 +86,27 @@ def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
     better_sigma = two_antennas if heading_sigma > 2 * two_antennas else heading_sigma / 2
     config = with_settings(sigmas.config, {'alignment.heading_source': 'heading_topic',
                                            'alignment.heading_sigma': better_sigma})
-    yield (f'a heading with {math.degrees(better_sigma):.2g} deg uncertainty', drive,
+    yield (f'a heading with {math.degrees(better_sigma):.2g} deg uncertainty',
            replace(sigmas, config=config))
     better_grades = GRADES[GRADES.index(sigmas.config.imu.grade) + 1:]
     if better_grades:
         config = with_settings(sigmas.config, {'imu.grade': better_grades[0]})
-        yield f'an IMU of {better_grades[0]} grade', drive, replace(sigmas, config=config)
+        yield f'an IMU of {better_grades[0]} grade', replace(sigmas, config=config)
 
 
 def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
     """Return the drive up to its farthest point from the start, None if that is the end."""
     inside = drive.t >= 0
+    # east + i north, from steps of travel in the direction of the yaw
     position = np.cumsum(np.gradient(drive.travel[inside]) * np.exp(1j * drive.yaw[inside]))
     from_start = np.abs(position - position[0])
     farthest = int(np.argmax(from_start))
-    gain = 0.9    # the end is far enough if it has this share of the largest distance
-    if from_start[-1] > gain * from_start[farthest]:
+    end_share = 0.9    # of the largest distance, at which the end is far enough
+    if from_start[-1] > end_share * from_start[farthest]:
         return None
     t_farthest = drive.t[inside][farthest]
     rest = max((end - begin for begin, end in drive.standstills(sigmas.config.leg.standstill)
-                if begin <= t_farthest <= end), default=30.0)      # s
+                if begin <= t_farthest <= end), default=DEFAULT_REST)
     moving = np.flatnonzero((np.abs(drive.speed) > REST_SPEED) & (drive.t <= t_farthest))
     return drive.cut_at(float(drive.t[min(moving[-1] + 1, len(drive.t) - 1)]), rest)
 
@@ -133,7 +131,7 @@ def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Teste
 
 
 def _with_dummy_values(method: MethodResult) -> MethodResult:
-    """Return the method with dummy values of undetermined parameters, so that legs combine."""
+    """Return the method with 0 for parameters without a value: only values are combined."""
     return replace(method, estimates={
         name: estimate if estimate.value is not None else Estimate(0.0, 0.0, estimate.unit)
         for name, estimate in method.estimates.items()})
@@ -141,9 +139,8 @@ def _with_dummy_values(method: MethodResult) -> MethodResult:
 
 def ranked(improvements: list[TestedChange], before: Plan, parameter: str) -> list[TestedChange]:
     """Return the changes that reduce the sigma of a parameter, best first."""
-    largest_share = 0.98    # of the old sigma: a change that leaves more is not listed
-    helpful = [change for change in improvements
-               if change.gain(before, parameter) > 1 / largest_share]
+    min_gain = 1 / 0.98    # a change with less is not listed
+    helpful = [change for change in improvements if change.gain(before, parameter) > min_gain]
     return sorted(helpful, key=lambda change: (-change.gain(before, parameter),
                                                change.sigmas[parameter]))
 
@@ -161,7 +158,11 @@ class Planned(Plan):
         return tested_changes(self.drive, self.sigmas, self)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the output of ``odocal plan --json``; sigmas of the scale are relative."""
+        """
+        Return the output of ``odocal plan --json``; sigmas of the scale are relative.
+
+        With ``improvements``, which takes some seconds at the first call.
+        """
         sigmas, two_point, alignment = self.sigmas, self.two_point, self.two_point.alignment
         return {
             'drive': {'distance': two_point.distance, 'chord': two_point.chord,
@@ -215,20 +216,19 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     settings = config_of(config, journal.settings if journal else None)
     bag_sigmas: dict[str, Any] = {}      # fields of Sigmas
     if scenario:
-        drive = planned_drives.from_scenario(scenario, duration)
+        drive = drive_sources.from_scenario(scenario, duration)
     elif gpx:
-        drive = planned_drives.from_gpx(Path(gpx), speed)
+        drive = drive_sources.from_gpx(Path(gpx), speed)
     elif bag:
-        drive, bag_sigmas = planned_drives.from_bag(Path(bag), settings, dict(topics or {}),
-                                                    journal)
-    elif speed is None:
-        raise BadUsage('--distance requires --speed, m/s')
+        drive, bag_sigmas = drive_sources.from_bag(Path(bag), settings, dict(topics or {}),
+                                                   journal)
     else:
         assert distance is not None
-        drive = planned_drives.from_figures(
-            speed, distance, 30.0 if standstill is None else standstill, turns or 0,
+        assert speed is not None
+        drive = drive_sources.from_figures(
+            speed, distance, DEFAULT_REST if standstill is None else standstill, turns or 0,
             1.0 if acceleration is None else acceleration)
-    if 'fix' in errors:      # twice the horizontal one, unless given too
+    if 'fix' in errors:      # fix_up is twice fix, unless it is given
         bag_sigmas |= {'fix_up': None}
     sigmas = Sigmas(config=settings, **(bag_sigmas | errors))
     return Planned(**vars(plan_methods(drive, sigmas)), drive=drive, sigmas=sigmas)
@@ -248,5 +248,7 @@ def _check_arguments(given: list[str], others: dict[str, Any]) -> None:
             raise BadUsage(f'--{name} requires {" or ".join(f"--{drive}" for drive in drives)}, '
                            f'not --{given[0]}')
     speed = others['speed']
+    if speed is None and given == ['distance']:
+        raise BadUsage('--distance requires --speed, m/s')
     if speed is not None and not (math.isfinite(speed) and speed > 0):
         raise BadUsage(f'--speed {speed:g}: required: a number above 0')

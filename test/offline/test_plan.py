@@ -15,7 +15,7 @@ import pytest
 from odocal_ros.forecast.planned_drive import add_stop_and_start
 from odocal_ros.forecast.planned_methods import plan_methods, predict_smoother
 from odocal_ros.forecast.predict import predict, Sigmas
-from odocal_ros.library import planned_drives
+from odocal_ros.library import drive_sources
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
@@ -105,7 +105,7 @@ def test_an_out_and_back_drive_needs_the_smoother(capsys):
     t = np.arange(0.0, motion.duration, 0.1)
     moving = np.flatnonzero(np.abs(motion.speed(t)) > 1e-6)
     stop = t[moving[np.flatnonzero(np.diff(moving) > 100)[0]]]
-    there = planned_drives.from_scenario('out_and_back', None).cut_at(
+    there = drive_sources.from_scenario('out_and_back', None).cut_at(
         stop - t[moving[0]] + 0.1, 30.0)
     expected = predict(there, Sigmas(config=with_settings(Config(), {'imu.grade': 'navigation'})))
     # both have a stop of 30 s, cut to a tenth of a second
@@ -117,7 +117,7 @@ def test_the_plan_of_the_smoother_equals_its_prediction(capsys):
                      '--slip-walk', '0.005')
     assert list(answer['methods']) == ['smoother', 'two_point']
     assert answer['verdict'] == 'accepted'      # the two-point method alone gives no yaw
-    drive = planned_drives.from_figures(15.0, 1000.0, 30.0, 0, 1.0)
+    drive = drive_sources.from_figures(15.0, 1000.0, 30.0, 0, 1.0)
     sigmas = Sigmas(config=with_settings(Config(), {
         'imu.grade': 'industrial', 'gnss.correlation_time': 0.0}), quantum=0.02, sway=0.1,
         slip=0.005)
@@ -167,7 +167,7 @@ def test_an_undetermined_yaw_is_reported_with_the_cause_and_the_remedy(tmp_path,
 def test_the_requested_methods_are_planned(method, shown, by):
     config = with_settings(Config(), {'method': method, 'alignment.heading_source': 'fixed',
                                       'alignment.heading_sigma': 0.002})
-    drive = planned_drives.from_figures(15.0, 500.0, 10.0, 0, 1.0)
+    drive = drive_sources.from_figures(15.0, 500.0, 10.0, 0, 1.0)
     plan = plan_methods(drive, Sigmas(config=config))
     assert list(plan.methods) == shown
     assert {plan.method_of(name) for name in NAMES[:2]} == {by}

@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.forecast.planned_methods import predict_smoother
 from odocal_ros.forecast.predict import Sigmas
-from odocal_ros.library import planned_drives
+from odocal_ros.library import drive_sources
 from odocal_ros.offline.cli import main
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_drive_from_figures_has_these_figures():
-    drive = planned_drives.from_figures(15.0, 3000.0, 20.0, 2, 1.0)
+    drive = drive_sources.from_figures(15.0, 3000.0, 20.0, 2, 1.0)
     assert drive.distance == pytest.approx(3000.0, rel=1e-6)
     assert drive.speed.max() == pytest.approx(15.0)
     # two ramps of 15 s, 225 m in total
@@ -27,7 +27,7 @@ def test_a_drive_from_figures_has_these_figures():
     assert drive.standstills(2.0)[0][1] == pytest.approx(0.0, abs=0.11)
     assert np.ptp(drive.yaw) == pytest.approx(math.pi / 2, rel=0.02)
     assert drive.yaw[-1] == pytest.approx(drive.yaw[0], abs=1e-6)     # left, then right
-    slow = planned_drives.from_figures(15.0, 100.0, 20.0, 0, 1.0)
+    slow = drive_sources.from_figures(15.0, 100.0, 20.0, 0, 1.0)
     assert slow.speed.max() == pytest.approx(10.0)         # v^2 = a d: no more in 100 m
     assert slow.distance == pytest.approx(100.0, rel=1e-6)
 
@@ -43,8 +43,8 @@ def test_speed_steps_of_a_gpx_track_do_not_reduce_the_sigmas(tmp_path, scenario,
         complex)[:, 0]
     sigmas = Sigmas()
     planned, drawn = (predict_smoother(drive, sigmas).estimates for drive in (
-        planned_drives.from_scenario(scenario, None),
-        planned_drives.from_gpx(gpx_of(tmp_path / 'a.gpx', t[::20], place.real, place.imag))))
+        drive_sources.from_scenario(scenario, None),
+        drive_sources.from_gpx(gpx_of(tmp_path / 'a.gpx', t[::20], place.real, place.imag))))
     # points 5 m apart hide the first 4 s of a start with 0.5 m/s^2, a sixth of its 25 s, and noise
     # adds to it; steps of speed at each point would halve the sigma of the straight drive
     for name in NAMES[:2]:
@@ -52,7 +52,7 @@ def test_speed_steps_of_a_gpx_track_do_not_reduce_the_sigmas(tmp_path, scenario,
 
 
 def test_a_gpx_track_gives_its_distance_speed_and_standstills(tmp_path, capsys):
-    drive = planned_drives.from_gpx(gpx(tmp_path / 'a.gpx'))
+    drive = drive_sources.from_gpx(gpx(tmp_path / 'a.gpx'))
     assert drive.distance == pytest.approx(4000.0, rel=2e-3)       # one point cuts the corner
     assert np.median(drive.speed[drive.speed > 0]) == pytest.approx(10.0, rel=1e-3)
     rest = drive.standstills(2.0)

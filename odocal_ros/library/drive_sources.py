@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Planned drives from figures, a named scenario, a GPX track or a read_topics bag."""
+"""Planned drives from figures, a named scenario, a GPX track or a recorded bag."""
 
 from datetime import datetime, UTC
 import math
