@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Calibrated values of a vehicle for dead reckoning.
-
-In: the estimates of a calibration, and settings. Out: scale, axes and lever arm, with sigmas;
-values that are not calibrated are assumed, and stated.
-"""
+"""Calibrated values of a vehicle for dead reckoning; assumed ones are stated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

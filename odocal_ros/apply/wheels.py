@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Travel of a vehicle by one or two wheels in a stream.
-
-In: odometer rows of one or two topics, each tested by its ``Wheel``. Out: travel between any two
-times, with its variance.
-"""
+"""Travel of a vehicle by one or two wheels in a stream."""
 
 from collections.abc import Sequence
 import math

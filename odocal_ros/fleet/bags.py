@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The bags of a fleet, and the vehicle of each.
-
-In: a manifest (a table), or folders, globs and URLs that fsspec supports. Out: ``FleetBag`` of
-each bag; a remote one is copied while it is read.
-"""
+"""The bags of a fleet, and the vehicle of each."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Dask as the engine of a fleet: local processes or an existing cluster.
-
-In: a function and its arguments for each task. Out: results and errors, as the tasks end.
-"""
+"""Dask as the engine of a fleet: local processes or an existing cluster."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Results of a fleet from the rows of its bags: vehicles, tables, page, reports, summary.
-
-Vehicles are computed in groups, each a task that writes its part of the table of legs.
-"""
+"""Results of a fleet from the rows of its bags: vehicles, tables, page, reports, summary."""
 
 from argparse import Namespace
 from collections import Counter

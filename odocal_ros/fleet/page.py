@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-fleet.html: the results of a fleet as one page that needs no network.
-
-In: the rows of vehicles.parquet and legs.parquet. Out: figures by vehicle model and over time, and
-tables of models and vehicles, the worst first.
-"""
+"""fleet.html: the results of a fleet as one page that needs no network."""
 
 from collections import Counter
 from collections.abc import Sequence

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The tables legs.parquet and vehicles.parquet of a fleet: their columns and rows, and writing.
-
-Each vehicle is compared with those of its model; the table of vehicles begins with the worst.
-"""
+"""The tables legs.parquet and vehicles.parquet of a fleet: their columns and rows, and writing."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime, UTC

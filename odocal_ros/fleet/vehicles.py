@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The result of a vehicle of a fleet: changes, calibration since the last change, pass or fail.
-
-In: the rows of its bags in the data set, with their legs. Out: its rows of the tables of vehicles
-and legs, and its calibration.
-"""
+"""The result of a vehicle of a fleet: changes, calibration since the last change, pass or fail."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,13 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Quantities of a leg: which are observable with the settings, and which are within their limits.
-
-Before a leg, ``find_observable`` decides with the functions that process recorded drives. While a
-leg is recorded, and of its result, the sigma of each quantity is compared with its limit: yes, no
-or unknown.
-"""
+"""Quantities of a leg: which are observable with the settings, and which are within limits."""
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Forecast from the running estimate of the smoother, or from the planar estimator.
-
-It contains sigmas, and the distance and manoeuvres that remain until the limits are reached.
-"""
+"""Forecast from the running estimate of the smoother, or from the planar estimator."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Comparison of calibrations of one vehicle, to detect changes of tyres, mounting or sensors.
-
-In: calibrations, the oldest first. Out: the change of each value since the first and since the
-previous calibration, in sigmas, and the likely cause of a significant change.
-"""
+"""Comparison of calibrations of one vehicle, to detect changes of tyres, mounting or sensors."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Read a bag into memory: samples of the chosen topics, marks of a node, settings of a journal.
-
-Out: a ``Recording``, from which legs are cut.
-"""
+"""Read a bag into memory: samples of the chosen topics, marks of a node, settings of a journal."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Assignment of a bag's topics to inputs (slots), for replay.
-
-In: names, types and message counts of the topics, and those that the user named. Out: slot ->
-topic, if exactly one topic fits each required input; else an error that lists the candidates.
-"""
+"""Assignment of a bag's topics to inputs (slots), for replay."""
 
 from collections.abc import Iterable, Mapping
 import re

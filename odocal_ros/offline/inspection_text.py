@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Text of ``odocal inspect``: the content of a bag as one screen.
-
-In: the dict of ``inspection.inspect``, with the topics, the drive and the findings. Out: lines of
-blocks: topics, statements on each input, drive, findings, suggested command.
-"""
+"""Text of ``odocal inspect``: the content of a bag as one screen."""
 
 from collections.abc import Callable, Iterable, Iterator
 import math

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Findings of odocal inspect on inputs and parts of a drive that a calibration lacks.
-
-In: the dict of ``inspection.inspect``, without findings. Out: reasons.
-"""
+"""Findings of odocal inspect on inputs and parts of a drive that a calibration lacks."""
 
 import math
 from typing import Any

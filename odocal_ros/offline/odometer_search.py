@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Search for an odometer in messages whose type does not say so, such as those of a vehicle bus.
-
-In: all numeric fields of a topic. Out: the fields whose travel is proportional to the path of the
-fixes, with their meaning (count, increment or speed), scale and settings.
-"""
+"""Search for an odometer in messages of other types, such as those of a vehicle bus."""
 
 from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-odocal plan: print the predicted accuracy of a calibration before the drive, and improvements.
-
-In: a scenario, track, bag or distance, and sensors and settings. ``library.plan`` predicts.
-"""
+"""odocal plan: print the predicted accuracy of a calibration before a drive, and improvements."""
 
 import argparse
 import math

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Choice of the most likely topic for each input of a bag, for odocal inspect and try.
-
-In: names, types and message counts of topics. Out: one topic for each input, the reason for it,
-and the replay command with those that replay would not choose without options.
-"""
+"""Choice of the most likely topic for each input of a bag, for odocal inspect and try."""
 
 from collections.abc import Collection, Iterable
 

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Facts that odocal inspect computes from samples, as dicts: see ``inspection.inspect``.
-
-Of each topic: timing, units and quality. Of the drive: the path of the fixes and how well a
-travel follows it, standstills, speeds and straight sections.
-"""
+"""Facts that odocal inspect computes from samples, as dicts: see ``inspection.inspect``."""
 
 from dataclasses import dataclass
 from typing import Any

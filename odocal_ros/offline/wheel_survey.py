@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Which values of a list (joints, counters) are wheels, and on which side, by their motion.
-
-In: a topic of lists, the turn rate of the IMU and the path of the fixes. Out: the motion of each
-value, and the settings that select the wheels.
-"""
+"""Which values of a list (joints, counters) are wheels, and on which side, by their motion."""
 
 from collections.abc import Sequence
 from itertools import chain

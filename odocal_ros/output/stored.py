@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Reading of calibration.json, with checks, and the test whether a result is worse than an old one.
-
-In: a file or folder, untrusted. Out: a ``Stored`` calibration, for comparisons, the link
-``latest``, fleets, and the IMU constants of an earlier calibration.
-"""
+"""Reading of calibration.json, untrusted, and the test whether a result is worse than another."""
 
 from dataclasses import dataclass, field
 import json
