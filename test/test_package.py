@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 import odocal_ros
-from odocal_ros.safe_io.licence import Licence, SPDX
+from odocal_ros.safe_io import licence
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
@@ -67,11 +67,11 @@ def test_all_files_have_the_same_version():
 
 
 def test_each_source_file_has_a_copyright_and_a_licence():
-    header, = SPDX.file_headers
+    header, = licence.SPDX.file_headers
     text = header.format(copyright='Copyright 2026 odocal_ros maintainers')
     head = '\n'.join(f'# {line}' for line in text.splitlines())
     assert (ROOT / 'setup.py').read_text().startswith(f'{head}\n\n')
-    assert f'{Licence.__module__}:SPDX' in (ROOT / 'setup.py').read_text()
+    assert f'{licence.__name__}:SPDX' in (ROOT / 'setup.py').read_text()
     folders = ('odocal_ros', 'reproductions', 'test', 'tools', 'benchmarks', 'examples', 'launch',
                'docs')
     files = [path for folder in folders for path in (ROOT / folder).rglob('*.py')]

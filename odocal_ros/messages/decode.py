@@ -27,7 +27,6 @@ from odocal_ros.messages.message_fields import (
     sensor_plan,
     SensorPlan,
     TRANSFORMS,
-    View,
 )
 from odocal_ros.messages.odometer_types import OdometerPlan
 from odocal_ros.messages.raws import FrameFilter, RawMessages, SMALL_BLOCK, Table, tables
@@ -125,8 +124,8 @@ class Reader:
     def _rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
               deserialize: Deserialize) -> Pairs:
         plan = self._plan
-        first = 0 if plan.columns else self._complete_plan(raws, deserialize)
-        if first:
+        if isinstance(plan, OdometerPlan) and not plan.columns:
+            first = self._complete_plan(plan, raws, deserialize)
             raws, received_ns = raws[first:], received_ns[first:]
         if not len(raws):
             return []
@@ -187,18 +186,17 @@ class Reader:
             values.append(np.asarray(value, column.dtype))
         return values
 
-    def _complete_plan(self, raws: Sequence[bytes], deserialize: Deserialize) -> int:
+    def _complete_plan(self, plan: OdometerPlan, raws: Sequence[bytes],
+                       deserialize: Deserialize) -> int:
         """Pass messages to the plan until it is complete; return the number of skipped ones."""
         for k, raw in enumerate(raws):
-            view: View | None = cdr.layout_of(self.msgtype,
-                                              raw) if self._plan.is_known_type else None
-            if view is None:
-                view = self._message_view(raw, deserialize)
-            if view is not None and self._plan.complete(view):
+            layout = cdr.layout_of(self.msgtype, raw) if plan.is_known_type else None
+            view = layout or self._message_view(raw, deserialize)
+            if view and plan.complete(view):
                 self.unreadable += k
                 return k
-            if view is not None:
-                self.error = self._plan.missing_reason(view)
+            if view:
+                self.error = plan.missing_reason(view)
         self.unreadable += len(raws)
         return len(raws)
 

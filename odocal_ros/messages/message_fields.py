@@ -153,16 +153,11 @@ class SensorPlan:
     """Fields to read from a stamped sensor message, and the function that builds samples."""
 
     form: samples.OdometerForm | None = None
-    is_known_type = True     # the layout is sufficient, no message is needed
 
     def __init__(self, slot: str, columns: Sequence[Column], build: Build) -> None:
         self.slot, self.has_readings = slot, slot == 'imu'
         self.columns = (*STAMP, *columns)
         self._build = build
-
-    def complete(self, view: View) -> bool:
-        """Return True: no column depends on the content of the first message."""
-        return True
 
     def missing_reason(self, view: View) -> str:
         return 'a message is incomplete'

@@ -3,16 +3,9 @@
 
 """The licence header of the source files, an entry point for ament_copyright (no SPDX itself)."""
 
-from typing import NamedTuple
+from types import SimpleNamespace
 
-
-class Licence(NamedTuple):
-    """A licence in the form of ament_copyright; the braces are the copyright line."""
-
-    name: str
-    file_headers: list[str]
-    license_files: list[str]
-    contributing_files: list[str]
-
-
-SPDX = Licence('Apache-2.0 by SPDX', ['{copyright}\nSPDX-License-Identifier: Apache-2.0'], [], [])
+# the braces are the copyright line
+SPDX = SimpleNamespace(
+    name='Apache-2.0 by SPDX', license_files=[], contributing_files=[],
+    file_headers=['{copyright}\nSPDX-License-Identifier: Apache-2.0'])
