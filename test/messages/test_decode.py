@@ -226,7 +226,7 @@ LEFT, RIGHT, LIST, FIELD = (f'odometer__{name}' for name in ('left', 'right', 'w
 
 
 @pytest.mark.parametrize(('slot', 'msgtype', 'settings_', 'error', 'words'), [
-    ('imu', 'std_msgs/msg/String', {}, BadData, 'give a topic of type sensor_msgs/msg/Imu'),
+    ('imu', 'std_msgs/msg/String', {}, BadData, 'supported: sensor_msgs/msg/Imu'),
     ('fix', 'sensor_msgs/msg/Imu', {}, BadData, 'sensor_msgs/msg/NavSatFix'),
     ('fix_velocity', 'geometry_msgs/msg/Twist', {}, BadData, 'TwistWithCovarianceStamped'),
     ('odometer', 'std_msgs/msg/String', {}, BadData, 'set odometer.field'),
