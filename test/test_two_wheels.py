@@ -77,10 +77,10 @@ def test_damaged_counts_are_not_a_span(made):
         value[row:row + 2] = 2**63 - 1, -2**63
     count = changed(count, value=lambda _: value)
     step = np.diff(value.astype(float))
-    same, found, uncertain_t, _ = correct_rollovers(count.stamp_ns * 1e-9, count, step, 'odometer')
+    same, found, uncertain = correct_rollovers(count.stamp_ns * 1e-9, count, step, 'odometer')
     assert same is count
     assert not found
-    assert not len(uncertain_t)
+    assert not len(uncertain.t)
 
 
 @pytest.mark.parametrize(('span', 'found'), [(256, True), (260, False), (2**16, True)])

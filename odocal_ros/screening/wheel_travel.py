@@ -12,7 +12,7 @@ of the same size: the modulus.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,16 @@ from odocal_ros.settings.config import Config
 KNOWN_MODULI = {'integer': 2.0 ** np.arange(6, 54),
                 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
 NAMED_MODULI = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
+
+
+class UncertainTravel(NamedTuple):
+    """Times at which travel is uncertain."""
+
+    t: Floats        # (k,) s
+    sigma: Floats    # (k,) scale units
+
+
+CERTAIN = UncertainTravel(np.empty(0), np.empty(0))    # definition: no uncertain travel
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,27 +140,28 @@ def _roundest_modulus(value: Values, rows: Ints, size: float,
 
 def correct_rollovers(
         t: Floats, samples: OdometerSamples, step: Floats, name: str, *, only_counter: bool = True,
-        ) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
+        ) -> tuple[OdometerSamples, tuple[Reason, ...], UncertainTravel]:
     """
-    Return rows with rollovers corrected, reasons, times and sigmas of uncertain travel.
+    Return rows with rollovers corrected, reasons, and the uncertain travel, in counts.
 
     t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its steps, rollovers
     of the message type's range corrected.   name : of the counter, in reasons.   only_counter :
-    the vehicle has no other one. Times are (k,) s, sigmas (k,) counts.
+    the vehicle has no other one.
     """
     found = find_rollovers(samples.value, step)
-    none = np.empty(0)
     if found is None:
-        return samples, (), none, none
+        return samples, (), CERTAIN
     direction = np.zeros(len(t), np.int64)
     direction[found.rows + 1] = found.direction
     is_integer = np.issubdtype(samples.value.dtype, np.integer)
     modulus = round(found.modulus) if is_integer else found.modulus
     value: NDArray[Any] = samples.value + modulus * np.cumsum(direction)
     # one error of the modulus for all jumps; the budget treats uncertainties as independent
-    uncertain_sigma = np.full(len(found.rows), found.sigma * np.sqrt(len(found.rows)))
-    return (replace(samples, value=value), (_rollover_reason(found, t, name, only_counter),),
-            *((t[found.rows], uncertain_sigma) if found.sigma else (none, none)))
+    count = len(found.rows)
+    uncertain = UncertainTravel(
+        t[found.rows], np.full(count, found.sigma * np.sqrt(count))) if found.sigma else CERTAIN
+    return (replace(samples, value=value),
+            (_rollover_reason(found, t, name, only_counter),), uncertain)
 
 
 def _rollover_reason(found: Rollovers, t: Floats, name: str, only_counter: bool) -> Reason:
@@ -179,8 +190,7 @@ class LegWheels:
     """Travel of the wheels, and its uncertain parts."""
 
     wheels: tuple[Travel, ...]
-    # name of a wheel -> times of uncertain travel, (k,) s, and its sigmas, (k,) scale units
-    uncertain_travel: dict[str, tuple[Floats, Floats]]
+    uncertain_travel: dict[str, UncertainTravel]      # by name of the wheel
 
     @property
     def _unsteered(self) -> list[Travel]:
@@ -195,12 +205,12 @@ class LegWheels:
     @property
     def uncertain_t(self) -> Floats:
         """Return the times at which the mean is uncertain, s."""
-        return np.concatenate([self.uncertain_travel[wheel.name][0] for wheel in self._unsteered])
+        return np.concatenate([self.uncertain_travel[wheel.name].t for wheel in self._unsteered])
 
     @property
     def uncertain_sigma(self) -> Floats:
         """Return the sigmas of the mean at these times, scale units."""
-        sigma: Floats = np.concatenate([self.uncertain_travel[wheel.name][1]
+        sigma: Floats = np.concatenate([self.uncertain_travel[wheel.name].sigma
                                         for wheel in self._unsteered])
         return sigma / len(self._unsteered)
 
@@ -215,7 +225,7 @@ def travel_of_wheels(leg: Leg, config: Config,
     """
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
-    wheels, uncertain, reasons = list[Travel](), dict[str, tuple[Floats, Floats]](), list[Reason]()
+    wheels, uncertain, reasons = list[Travel](), dict[str, UncertainTravel](), list[Reason]()
     for slot, name in zip(slots, names, strict=True):
         form = leg.form_of(slot)
         if _form_text(form) != _form_text(leg.form):
@@ -242,15 +252,15 @@ def travel_of_wheels(leg: Leg, config: Config,
 
 
 def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
-                      side: str) -> tuple[Travel, tuple[Floats, Floats], list[Reason]]:
-    """Return the travel of a wheel, times, s, and sigmas of its uncertain travel, and reasons."""
+                      side: str) -> tuple[Travel, UncertainTravel, list[Reason]]:
+    """Return the travel of a wheel, its uncertain travel, and reasons."""
     name = f"the {side} wheel's counter" if side else 'the counter'
     odometer = f'{side} odometer'.strip()
-    uncertain_t = uncertain_sigma = np.empty(0)
+    uncertain = CERTAIN
     reasons: list[Reason] = []
     if form.quantity == 'cumulative':
         step = odometer_rows.counter_steps(samples.value, form.modulus)
-        samples, rollover_reasons, uncertain_t, uncertain_sigma = correct_rollovers(
+        samples, rollover_reasons, uncertain = correct_rollovers(
             t, samples, step, name, only_counter=not side)
         reasons += rollover_reasons
     samples, t, false_reasons = odometer_rows.without_false_rows(samples, t, form, odometer)
@@ -258,7 +268,7 @@ def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, c
     travel, reset_reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
     travel, gap_t, gap_sigma = odometer_rows.with_gap_uncertainty(travel, samples.value, form)
     return (replace(travel, name=side),
-            (np.append(uncertain_t, gap_t), np.append(uncertain_sigma, gap_sigma)),
+            UncertainTravel(np.append(uncertain.t, gap_t), np.append(uncertain.sigma, gap_sigma)),
             [*reasons, *false_reasons, *late_reasons, *reset_reasons])
 
 
