@@ -15,7 +15,7 @@ from odocal_ros.settings.node_configs import ApplyConfig
 STILL_COUNTS = 1.5    # physical: largest number of counts of a wheel at rest
 SIDES = ('odometer', 'odometer_right')
 Rows = tuple[str, Sequence[Reading], OdometerForm]
-MAX_WAITING = 100       # judgement: blocks of rows kept before the first IMU message
+MAX_WAITING_BLOCKS = 100       # judgement: blocks of rows kept before the first IMU message
 
 
 class Wheels:
@@ -34,7 +34,7 @@ class Wheels:
         """Add rows of a wheel; zero_ns : stamp of t = 0, 0 before the first IMU message."""
         self._waiting.append((slot, rows, form))
         if not zero_ns:
-            self._waiting = self._waiting[-MAX_WAITING:]
+            self._waiting = self._waiting[-MAX_WAITING_BLOCKS:]
             return
         for block in self._waiting:
             self._add_rows(*block, zero_ns)
