@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Jobs of a fleet, one for each bag: their settings, their submission, and the row of a worker.
-
-A worker runs the pipeline of replay with limits of time and memory.
-"""
+"""Jobs of a fleet, one for each bag: their settings, submission, and the row of a worker."""
 
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence

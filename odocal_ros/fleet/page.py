@@ -22,8 +22,6 @@ from odocal_ros.output.value_text import counted, MAIN_VALUES, with_sigma
 from odocal_ros.settings.levels import TYRE_SPREAD
 
 MAX_POINTS = 3000       # judgement: of a picture: more are thinned, except outliers
-TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting angle',
-          'pitch_mounting_angle': 'Pitch mounting angle'}
 
 
 def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[style.Drawing]:
@@ -64,7 +62,7 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> style.Drawing:
     _limit_axis(ax, np.array(points))
     ax.set_xticks(range(len(models)), [model or 'no model' for model in models])
     ax.set_ylabel('deviation from the median, ' + ('%' if is_scale else 'deg'))
-    title = f'{TITLES[name]} by model.'
+    title = f'{name.replace("_", " ").capitalize()} by model.'
     description = ('One point per vehicle with its sigma; red: outlier of its model; arrow: '
                    'outside the plot.')
     return title, description, style.svg(figure, f'population-{MAIN_VALUES[name]}',

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The drive in a bag, for odocal inspect: what IMU, odometer and fixes show only together.
-
-In: the samples of the selected topics. Out: path, speeds, standstills, legs and IMU orientation,
-findings on units, axes and missing data, and the settings that correct them.
-"""
+"""The drive in a bag, for odocal inspect: what IMU, odometer and fixes show only together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-odocal replay: calibrate from recorded bags, with the same computation as the node.
-
-In: bags, and topics, settings and legs as options. Out: the result files, and a summary as text
-or JSON. Also defines the options that other commands share with it.
-"""
+"""odocal replay: calibrate from recorded bags as the node does; options shared by commands."""
 
 import argparse
 import os

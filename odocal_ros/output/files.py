@@ -122,11 +122,8 @@ def write_results(calibration: result.Calibration, config: Config, directory: Pa
                   inputs: list[dict[str, Any]], created: str, force: bool = False,
                   warn: Callable[[str], None] = lambda note: None) -> list[Path]:
     """
-    Write the result files and return their paths, calibration.json first, the report last.
+    Write the result files, as ``library.Calibration.save``; return their paths.
 
-    ``warn`` receives a sentence if the report cannot be drawn.
-
-    Raises BadUsage: a calibration.json exists and no ``force``, or the folder is not writable.
     Raises KeyboardInterrupt: its text names the written results, if any.
     """
     results = Results(calibration, config, directory, inputs, created)

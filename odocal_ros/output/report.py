@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The page report.html: figures and tables of a calibration, by a jinja2 template.
-
-It loads nothing from the network. If it cannot be drawn, a page that states the error replaces it.
-"""
+"""The page report.html, which needs no network: figures and tables of a calibration, by jinja2."""
 
 from collections import Counter
 from html import escape

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Numbers, reasons and decisions as text, by the same rules in terminal, report and answers.
-
-The sigma determines the digits of a value; the most severe reasons come first.
-"""
+"""Numbers, reasons and decisions as text, by the same rules in terminal, report and answers."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Odometer rows with false values: false counts, frozen counters, lost increments.
-
-Rows with false counts are dropped if the counter continues normally after them. Travel
-that is not measured, at a reset or in a gap of speeds or increments, is a source of the budget.
-"""
+"""Odometer rows with false values: false counts, frozen counters, lost increments."""
 
 from dataclasses import replace
 from typing import Any

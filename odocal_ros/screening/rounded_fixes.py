@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Uncertainty of fixes with rounded coordinates: float32, NMEA with four decimals of a minute.
-
-The rounding error is not in the covariance of the receiver. It is not white: consecutive equal
-coordinates, at a standstill or along the other axis, have the same error.
-"""
+"""Uncertainty of fixes with rounded coordinates: float32, or NMEA with few decimals."""
 
 import numpy as np
 
