@@ -34,8 +34,8 @@ MEAN_STEPS = 10
 MIN_FIT_CELLS = 20      # judgement: of a fit
 # priors of the fit: s, sigma of the delay between the wheels, and of wheels to IMU, by drivers'
 # delays; s^2/m, sigma of the change of rolling radius by sideways acceleration. Physical
-WHEEL_DELAY_SIGMA, LOAD_SIGMA = 0.05, 2e-3
-WHEEL_DELAY_WIDTH = 1.5       # m, judgement: a delay to the IMU acts as this track width times it
+PAIR_DELAY_SIGMA, LOAD_SIGMA = 0.05, 2e-3
+PAIR_DELAY_WIDTH = 1.5       # m, judgement: a delay to the IMU acts as this track width times it
 # least sigma of the travel in a cell, counts and m: judgement, rounding of one edge, and a bump
 MIN_TRAVEL_SIGMA = 0.4, 1e-3
 
@@ -85,8 +85,8 @@ def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
     if keep.sum() < MIN_FIT_CELLS:
         return None
     width_sigma = TRACK_WIDTH.first_sigma / metres_per_unit
-    prior = np.array([np.inf, width_sigma, np.inf, WHEEL_DELAY_SIGMA,
-                      WHEEL_DELAY_SIGMA * WHEEL_DELAY_WIDTH / metres_per_unit, LOAD_SIGMA])
+    prior = np.array([np.inf, width_sigma, np.inf, PAIR_DELAY_SIGMA,
+                      PAIR_DELAY_SIGMA * PAIR_DELAY_WIDTH / metres_per_unit, LOAD_SIGMA])
     prior = np.append(prior, np.full(regressors.shape[1] - len(prior), np.inf))
     counts, metres = MIN_TRAVEL_SIGMA
     min_sigma = counts * pair.quantum + metres / metres_per_unit
