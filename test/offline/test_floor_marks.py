@@ -133,7 +133,7 @@ def test_impossible_marks_are_refused(change, message, tmp_path):
 def test_marks_and_a_reference_topic_exclude_each_other(tmp_path):
     made = simulate(SimOptions(scenario='square', imu_rate=20.0))
     bag = write_bag(tmp_path / 'bag', drive_topics(made))
-    with pytest.raises(BadUsage, match='--fix-topic /slam/pose: marks'):
+    with pytest.raises(BadUsage, match='--fix-topic /slam/pose: reference.marks is set'):
         calibrate_bag(bag, TOPICS | {'fix': '/slam/pose'}, marks_config(made))
 
 
