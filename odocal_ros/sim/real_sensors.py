@@ -94,7 +94,7 @@ def drift_and_vibration(t: Floats, speed: Floats, options: SimOptions) -> list[F
         total = warmth * np.array(slope) if real.warm_rise and any(slope) else 0.0
         if any(step := getattr(real, f'{name}_step')):
             total = total + (t >= real.bias_step_at)[:, None] * np.array(step)
-        if sigma:
+        if sigma:      # the key of the random numbers must not change
             total = total + _instability(make_rng(options.seed, f'real {name} wander'), sigma,
                                          real.instability_time, t)
         if rms:
