@@ -27,7 +27,7 @@ setup(
     ],
     python_requires='>=3.11',
     # modules of odocal_ros that are not stable: of the same version alone
-    install_requires=[f'odocal_ros=={VERSION}', 'numpy>=1.26'],
+    install_requires=[f'odocal_ros=={VERSION}', 'numpy>=1.26', 'pyproj>=3.6'],
     entry_points={
         # commands that odocal_ros.offline.cli finds here
         'odocal.commands': [f'{name} = {NAME}.{name}.command' for name in ('paper', 'patent')],

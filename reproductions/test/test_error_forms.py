@@ -12,7 +12,7 @@ import pytest
 from odocal_reproductions.paper.error_forms import chord_error, plane_error, SpeedProfile
 from odocal_reproductions.paper.error_model import PAPER_RADIUS, propagate
 from odocal_reproductions.paper.path import planned_path
-from odocal_ros.nav.geodesy import Plane
+from odocal_reproductions.paper.plane import gauss_krueger
 from odocal_ros.nav.rotations import wrap
 
 DRIFT = np.deg2rad(0.01) / 3600     # 0.01 deg/h
@@ -39,14 +39,13 @@ def papers_profile(n=4001):
 @pytest.mark.parametrize('latitude_deg', [20.0, 35.0, 50.0])
 @pytest.mark.parametrize('from_meridian_deg', [-3.0, -1.5, 0.5, 3.0])
 def test_plane_error_is_the_derivative_of_the_projection(latitude_deg, from_meridian_deg):
-    meridian = 117.0
-    latitude, longitude = np.deg2rad([latitude_deg, meridian + from_meridian_deg])
-    plane, h = Plane(meridian, ellipsoid='Krassovsky'), 1e-6
-    by_L, by_lam = (np.subtract(plane.forward(latitude + a, longitude + b),
-                                plane.forward(latitude - a, longitude - b)) / (2 * h)
-                    for a, b in ((h, 0), (0, h)))
-    L = plane_error(latitude, longitude, np.deg2rad(meridian), 1.0, 0.0)
-    lam = plane_error(latitude, longitude, np.deg2rad(meridian), 0.0, 1.0)
+    latitude, meridian = np.deg2rad([latitude_deg, 117.0])
+    longitude, h = meridian + np.deg2rad(from_meridian_deg), 1e-6
+    by_L, by_lam = (np.subtract(gauss_krueger(latitude + a, longitude + b, meridian, 'krass'),
+                                gauss_krueger(latitude - a, longitude - b, meridian, 'krass'))
+                    / (2 * h) for a, b in ((h, 0), (0, h)))
+    L = plane_error(latitude, longitude, meridian, 1.0, 0.0)
+    lam = plane_error(latitude, longitude, meridian, 0.0, 1.0)
     # (13), (14) against the derivative of (4), (5), within 3 deg, at 20 to 50 deg
     assert L[0] == pytest.approx(by_L[0], rel=1.25e-5)
     assert L[1] == pytest.approx(by_L[1], rel=0.0095)
@@ -93,8 +92,7 @@ def test_end_error_through_plane_and_chord_is_minus_the_mean_heading_error():
     latitude, longitude = np.deg2rad([40.0, 116.0])
     path = planned_path(profile.t, speed, np.pi / 4, latitude, longitude)
     x = propagate(path, [0, 0, PHI_U, 0, 0, 0], [0, 0, DRIFT])[-1]
-    plane = Plane(116.0)
-    (n0, n1), (e0, e1) = plane.forward(path.latitude[[0, -1]], path.longitude[[0, -1]])
+    (n0, n1), (e0, e1) = gauss_krueger(path.latitude[[0, -1]], path.longitude[[0, -1]], longitude)
     dx, dy = plane_error(path.latitude[-1], path.longitude[-1], longitude, x[3], x[4])
     dK, dalpha = chord_error(n1 - n0, e1 - e0, dx, dy, np.hypot(n1 - n0, e1 - e0), 1.0)
     expected, _ = profile.heading_and_drift(PHI_U, DRIFT)

@@ -18,10 +18,10 @@ from odocal_reproductions.paper.coefficients import GYRO_DRIFT, HEADING_ERROR, T
 from odocal_reproductions.paper.error_forms import chord_error, plane_error, SpeedProfile
 from odocal_reproductions.paper.error_model import LAT, LON, propagate, U
 from odocal_reproductions.paper.path import Path, planned_path
+from odocal_reproductions.paper.plane import gauss_krueger
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.geodesy import plane_for
 from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
@@ -129,8 +129,7 @@ class PaperDrive:
         path = self.path()
         x = propagate(path, [*phi_n, 0.0, 0.0, 0.0], eps_b)     # no position error at the start
         meridian = path.longitude[0]
-        north, east = plane_for(self.config.projection, meridian).forward(
-            path.latitude, path.longitude)
+        north, east = gauss_krueger(path.latitude, path.longitude, meridian)
         north, east = north - north[0], east - east[0]
         dx, dy = plane_error(path.latitude, path.longitude, meridian, x[:, LAT], x[:, LON])
         chord = np.hypot(north, east)
