@@ -188,8 +188,6 @@ class Code(Enum):
     YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, provide a better '
                                     'heading, or combine legs. The limit is '
                                     'verdict.max_yaw_sigma.')
-    PLANES_DISAGREE = CAUTION, ('Check the fixes and heights at the marks. If they are right, '
-                                'please report this with the trace file.')
     # left and right wheel
     ODOMETER_CHOSEN = NOTE, ('If correct, ignore. Otherwise set odometer.left and '
                              'odometer.right, or select one value with odometer.field.')

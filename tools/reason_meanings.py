@@ -224,9 +224,6 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'budget lists the largest sources.',
         Code.YAW_SIGMA_TOO_LARGE: 'The uncertainty of the yaw is above `verdict.max_yaw_sigma`. '
         'The value is correct within its uncertainty.',
-        Code.PLANES_DISAGREE: 'The scale from the straight-line distance between the marks (in a '
-        'map plane or on the ellipsoid) differs from the estimated scale. This is a check of the '
-        'computation.',
     },
     'Left and right wheel': {
         Code.ODOMETER_CHOSEN: 'A message holds several values (joints, or an array) and no '

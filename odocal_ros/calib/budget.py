@@ -168,8 +168,6 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
         'height': (D[-1] * (np.sqrt(height_variance / 2)
                             if start.height_known and end.height_known
                             else HEIGHT_UNKNOWN) / SEMI_MAJOR_AXIS)[:, None],
-        # zero, as the chord is in space, not in a plane; a key of calibration.json
-        'projection': np.zeros((3, 1)),
     }
     gradient = parameter_gradient(f) @ np.linalg.inv(M)
     # errors that are the same in every leg of a vehicle

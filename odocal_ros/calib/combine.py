@@ -4,7 +4,7 @@
 """
 Combination of the results of one method on several legs of a vehicle, by a weighted mean.
 
-Errors of single legs average down, errors shared by all legs do not: docs/method.md (T15), (T16).
+Errors of single legs average down, errors shared by all legs do not: docs/method.md (T14), (T15).
 """
 
 from collections.abc import Mapping, Sequence
@@ -83,7 +83,7 @@ def last_leg_values(results: Sequence[MethodResult],
 def _combine(parameter: str, i: int, results: Sequence[MethodResult], walk_variance: Floats,
              ) -> tuple[float, float, dict[str, Floats], tuple[Reason, ...]]:
     """Return mean, unshared variance, shared effects by name, and reasons of parameter i."""
-    # docs/method.md (T15), (T16)
+    # docs/method.md (T14), (T15)
     is_scale = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in results])
     y = np.log(x) if is_scale else x
@@ -128,7 +128,7 @@ def _shared_effects(i: int, results: Sequence[MethodResult]) -> dict[str, Floats
 
 
 def _weights(covariance: Floats) -> Floats:
-    """Return the weights, none below zero, of the mean with the least variance: (T15)."""
+    """Return the weights, none below zero, of the mean with the least variance: (T14)."""
     # by unshared errors alone, a leg that a shared error dominates would make the mean worse
     from scipy.optimize import nnls
     root = np.linalg.cholesky(covariance / np.trace(covariance))

@@ -8,13 +8,12 @@ Shi et al. 2015 uses the ratio of two chords in a plane and the angle between th
 The same similarity is solved here in the Earth-fixed Cartesian frame n, where track and truth are
 exactly similar. With M the attitude summed over travel and c the chord, the vector between the
 reference positions of the marks, M f = c gives f = K forward_b: the scale K times the forward axis
-in b, which is scale, yaw and pitch at once. The plane and the geodesic are the cross-check.
+in b, which is scale, yaw and pitch at once.
 Frames n, b and v: ``odocal_ros/__init__.py``.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -26,14 +25,7 @@ from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_valu
 from odocal_ros.calib.slip import slip_source
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.dead_reckoning import (
-    axes_from_forward,
-    forward_b,
-    mounting_from_forward,
-    Origin,
-    Track,
-)
-from odocal_ros.nav.geodesy import geodesic_chord, plane_chord, plane_for
+from odocal_ros.nav.dead_reckoning import axes_from_forward, mounting_from_forward, Track
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -45,7 +37,6 @@ PITCH_PRIOR = 0.05
 PITCH_LIMIT = 0.26
 # judgement: of the path length; on a shorter chord the errors of its ends dominate
 MIN_CHORD_SHARE = 0.2
-CHECKED_NOMINAL = 0.5, 2.0     # judgement: nominal over estimated scale in the cross-check
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +44,6 @@ class TwoPointInput:
     """Input of the two-point method."""
 
     track: Track
-    origin: Origin
     start: MarkFix
     end: MarkFix
     lever_v: Floats     # (3,) antenna from the odometer's point, m
@@ -172,14 +162,9 @@ def fit(inputs: TwoPointInput, nominal_scale: float, scale_unit: str, quantum: f
         for axis, bias, bias_sigma in zip('xyz', inputs.alignment.gyro_bias,
                                           inputs.alignment.gyro_bias_sigma, strict=True):
             estimates[f'gyro_bias_{axis}'] = Estimate(float(bias), float(bias_sigma), 'rad/s')
-    # of a scale that is far off, the chords would differ too much for a comparison
-    lowest, highest = CHECKED_NOMINAL
-    check = _cross_check(inputs, f, nominal_scale if lowest < nominal_scale / K < highest else K,
-                         config)
-    reasons += _plane_reasons(check, K, sigma[0])
     return MethodResult('two_point', reasons, estimates, budget.PARAMETERS, sources, {
         'budget': budget.budget_table(sources, budget.PARAMETERS, (K, 1.0, 1.0)),
-        'correlation': budget.correlations(covariance, budget.PARAMETERS), 'cross_check': check,
+        'correlation': budget.correlations(covariance, budget.PARAMETERS),
         'heading_source': inputs.alignment.heading_source, 'f': f})
 
 
@@ -255,40 +240,3 @@ def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
                            f'{np.rad2deg(deviation):.1f} deg from its nominal value; the limit is '
                            f'{np.rad2deg(FAR_YAW):.0f} deg'),)
     return reasons, alignment.heading_separable and heading_sigma <= limit
-
-
-def _cross_check(inputs: TwoPointInput, f: Floats, nominal_scale: float,
-                 config: Config) -> dict[str, dict[str, float]]:
-    """Return K and yaw by eq. (6)-(10) of Shi et al. in the plane and by the geodesic: (T14)."""
-    # the track has nominal_scale, yaw 0 and the estimated pitch, and begins at the start mark.
-    # As in the paper, o is the start, b the end by the fixes, b_dr the end of the track
-    K = np.linalg.norm(f)
-    _, pitch = map(float, mounting_from_forward(f / K))
-    attitude_change = inputs.track.C_nb_at(inputs.end.t) - inputs.track.C_nb_at(inputs.start.t)
-    start_n = inputs.start.position_n
-    end_n = inputs.end.position_n - attitude_change @ axes_from_forward(f) @ inputs.lever_v
-    reckoned_n = start_n + nominal_scale * inputs.M @ forward_b(0.0, pitch)
-    o, b, b_dr = (inputs.origin.to_geodetic(p) for p in (start_n, end_n, reckoned_n))
-    plane = plane_for(config.projection, o[1] + wrap(b[1] - o[1]) / 2)
-    results = {}
-    chords: dict[str, Callable[[Floats, Floats], tuple[float, float]]] = {
-        'plane': partial(plane_chord, plane), 'geodesic': geodesic_chord}
-    for name, chord_of in chords.items():
-        (s1, bearing), (s2, bearing_dr) = chord_of(o, b), chord_of(o, b_dr)
-        results[name] = {'S1': s1, 'S2': s2, 'scale_factor': float(nominal_scale * s1 / s2),
-                         'alpha_psi': float(wrap(bearing - bearing_dr))}
-    return results
-
-
-def _plane_reasons(check: dict[str, dict[str, float]], K: float,
-                   sigma_relative: float) -> tuple[Reason, ...]:
-    """Return PLANES_DISAGREE if the ratio of chords differs from the estimated scale."""
-    worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
-    # relative: a plane about the leg preserves ratios of chords far better; a deviation below a
-    # fifth of the sigma has no effect. Judgement
-    limit = 3e-5 + 0.2 * sigma_relative
-    if worst > limit:
-        return (Reason(Code.PLANES_DISAGREE, 'the scale from the straight-line distance between '
-                       'the marks (in a map plane or on the ellipsoid) differs from the '
-                       f'estimated scale by {with_limit(100 * worst, 100 * limit, "%")}'),)
-    return ()

@@ -128,8 +128,7 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     start, end = (_expected_mark(t, track, drive, sigmas, spans, limit) for t, limit in (
         (0.0, config.reference.start), (drive.duration, config.reference.end)))
     two_point = TwoPointInput(
-        track, Origin(drive.latitude, drive.longitude, drive.height), start, end, np.zeros(3),
-        _velocity_change(track, (start, end)), alignment)
+        track, start, end, np.zeros(3), _velocity_change(track, (start, end)), alignment)
     reasons = (*alignment_reasons, *drive_reasons)
     refused = refusal_reasons(two_point, 1.0)
     if refused:

@@ -26,7 +26,7 @@ from odocal_ros.output.stored import check_estimate
 from odocal_ros.reasons import Verdict
 from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config, SETTINGS, settings_of, with_settings
-from odocal_ros.settings.setting import Setting
+from odocal_ros.settings.setting import REMOVED_GROUPS, Setting
 
 SCALE_UNIT = 'm/pulse, m/rad or 1'      # by the kind of odometer
 # estimates in ``result.*`` of the calibrator, and their units
@@ -109,7 +109,7 @@ def declare_settings(node: Node, kind: type = Config) -> Any:
 
 def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
     """Warn of overrides that ROS ignores: unknown ones in a group or with a similar name."""
-    groups = {name.partition('.')[0] for name in settings if '.' in name}
+    groups = REMOVED_GROUPS | {name.partition('.')[0] for name in settings if '.' in name}
     for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public access to them
         group, dot, _ = name.partition('.')
         similar = difflib.get_close_matches(name, settings, 1, 0.8)

@@ -1,4 +1,4 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Earth, projection, rotations, strapdown, odometer, dead reckoning, standstills."""
+"""Earth, rotations, strapdown, odometer, dead reckoning, standstills."""

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The Earth: WGS 84 ellipsoid, gravity and rates; geodetic, Earth-fixed, local and plane coordinates.
+The Earth: WGS 84 ellipsoid, gravity and rates; geodetic, Earth-fixed and local coordinates.
 
 A local metric frame is a tangent plane of the ellipsoid (x east, y north, z up) at
-FRAME_LONGITUDE, for methods that use the ellipsoid. Only its latitude has a meaning. Plane
-coordinates (leg-centred, Gauss-Krueger, UTM) and geodesics are by pyproj.
+FRAME_LONGITUDE, for methods that use the ellipsoid. Only its latitude has a meaning.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
@@ -19,7 +18,6 @@ from numpy.typing import ArrayLike
 from odocal_ros.data.arrays import FloatOrFloats, Floats, Ints
 from odocal_ros.data.samples import FixSamples, from_columns, LOCAL_STATUS
 from odocal_ros.nav.rotations import arctan2
-from odocal_ros.settings.config import ProjectionConfig
 
 # physical: all of WGS 84 (NIMA TR8350.2)
 SEMI_MAJOR_AXIS = 6378137.0    # m
@@ -36,10 +34,6 @@ LARGEST_FRAME = 20_000.0
 # m, least significant motion of positions, by GNSS and in a local frame. Judgement: a receiver at
 # rest drifts by many metres, SLAM and motion capture by centimetres
 MIN_GNSS_MOTION, MIN_LOCAL_MOTION = 20.0, 0.5
-# semi-major axis m, inverse flattening
-ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
-              'Krassovsky': (6378245.0, 298.3)}
-ZONE_WIDTH = 6.0       # deg, of UTM and of Gauss-Krueger's wide zones: format
 
 
 def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:
@@ -156,49 +150,3 @@ def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
         return from_columns(FixSamples, stamps, received, *geodetic, covariance_n, kind,
                             np.full(n, LOCAL_STATUS))
     return build
-
-
-@dataclass(frozen=True)
-class Plane:
-    """A transverse Mercator plane, for the chord of the two-point method."""
-
-    central_meridian: float     # deg
-    scale: float = 1.0          # on the central meridian
-    ellipsoid: str = 'WGS84'    # a name of ELLIPSOIDS
-
-    def forward(self, latitude: Floats, longitude: Floats) -> tuple[Floats, Floats]:
-        """Return northing, easting, m (eq. 1-5 of Shi et al. 2015), from rad: (...)."""
-        from pyproj import Proj
-        a, rf = ELLIPSOIDS[self.ellipsoid]
-        proj = Proj(proj='tmerc', lat_0=0, lon_0=self.central_meridian, k_0=self.scale,
-                    x_0=500000.0, y_0=0, a=a, rf=rf)
-        easting, northing = proj(np.rad2deg(longitude), np.rad2deg(latitude))
-        return np.asarray(northing), np.asarray(easting)
-
-
-def plane_for(projection: ProjectionConfig, longitude: float) -> Plane:
-    """Return the plane by the projection settings for a longitude, rad."""
-    degrees = float(np.rad2deg(longitude))
-    meridian = projection.central_meridian
-    if np.isnan(meridian):
-        zone = ZONE_WIDTH * np.floor(degrees / ZONE_WIDTH) + ZONE_WIDTH / 2
-        meridian = degrees if projection.kind == 'leg' else zone
-    scale = {'leg': 1.0, 'gauss_krueger': 1.0, 'utm': 0.9996}
-    return Plane(float(meridian), scale[projection.kind], projection.ellipsoid)
-
-
-def plane_chord(plane: Plane, start: Sequence[float] | Floats,
-                end: Sequence[float] | Floats) -> tuple[float, float]:
-    """Return length, m, and grid bearing, rad, of a chord between latitudes, longitudes, rad."""
-    (n0, n1), (e0, e1) = plane.forward(np.array([start[0], end[0]]), np.array([start[1], end[1]]))
-    return float(np.hypot(n1 - n0, e1 - e0)), float(np.arctan2(e1 - e0, n1 - n0))
-
-
-def geodesic_chord(start: Sequence[float] | Floats,
-                   end: Sequence[float] | Floats) -> tuple[float, float]:
-    """Return length at the mean height, m, and azimuth, rad, of the WGS 84 geodesic."""
-    from pyproj import Geod
-    azimuth, _, length = Geod(ellps='WGS84').inv(
-        np.rad2deg(start[1]), np.rad2deg(start[0]), np.rad2deg(end[1]), np.rad2deg(end[0]))
-    height = (start[2] + end[2]) / 2
-    return float(length * (1 + height / 6371008.8)), float(np.deg2rad(azimuth))

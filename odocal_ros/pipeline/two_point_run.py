@@ -111,8 +111,8 @@ class TwoPointRun:
         if start is None or end is None:
             return None
         two_point = TwoPointInput(
-            track, prepared.origin, start, end, prepared.lever_v,
-            self._velocity_change((start, end)), prepared.alignment,
+            track, start, end, prepared.lever_v, self._velocity_change((start, end)),
+            prepared.alignment,
             (self.inputs.uncertain_t, self.inputs.uncertain_sigma))
         exact = all(m.standing or m.surveyed for m in (start, end))
         if exact or refusal_reasons(two_point, prepared.rough_scale):

@@ -240,15 +240,6 @@ class WheelsConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectionConfig:
-    kind: str = setting('leg', choices=('leg', 'gauss_krueger', 'utm'), about='Plane of the '
-                        'chord check: local transverse Mercator, a Gauss-Krueger zone, or UTM.')
-    ellipsoid: str = setting('WGS84', choices=('WGS84', 'CGCS2000', 'Krassovsky'), about=(
-        'Ellipsoid of the plane.'))
-    central_meridian: float = setting(NAN, 'deg', about='Central meridian; NaN: zone of the leg.')
-
-
-@dataclass(frozen=True, kw_only=True)
 class Config:
     """All settings of the calibrator; the module docstring defines their names."""
 
@@ -267,7 +258,6 @@ class Config:
     alignment: AlignmentConfig = AlignmentConfig()
     reference: config_groups.ReferenceConfig = config_groups.ReferenceConfig()
     wheels: WheelsConfig = WheelsConfig()
-    projection: ProjectionConfig = ProjectionConfig()
     verdict: config_groups.VerdictConfig = config_groups.VerdictConfig()
     accept: config_groups.AcceptConfig = config_groups.AcceptConfig()
     output: config_groups.OutputConfig = config_groups.OutputConfig()

@@ -18,7 +18,7 @@ from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.safe_io.limits import read_text
 from odocal_ros.safe_io.text_formats import compose_yaml
 from odocal_ros.settings.config import Config, SETTINGS
-from odocal_ros.settings.setting import with_settings
+from odocal_ros.settings.setting import REMOVED_GROUPS, with_settings
 
 NODE = '/calibrator'
 PARAMETERS = 'ros__parameters'
@@ -55,7 +55,7 @@ def _root(path: Path) -> Node:
                         '(YAML)') from None
 
 
-def _settings(path: Path, root: Node) -> dict[str, object]:
+def _settings(path: Path, root: Node, without_removed: bool = False) -> dict[str, object]:
     blocks = _blocks(root, '')
     matching = [block for key, block in blocks.items() if _matches_calibrator(key)]
     if not matching:
@@ -65,16 +65,17 @@ def _settings(path: Path, root: Node) -> dict[str, object]:
     values: dict[str, object] = {}
     for name, node in (pair for block in matching for mapping in block
                        for pair in _dotted_values(mapping, '')):
-        if not FOREIGN_PARAMETERS.match(name):
+        if not (FOREIGN_PARAMETERS.match(name)
+                or without_removed and name.partition('.')[0] in REMOVED_GROUPS):
             where = f'{path}, line {node.start_mark.line + 1}: '
             values[name] = _check_value(name, _value(node), where)
     return values
 
 
 def read_journal_file(path: Path, block: str) -> tuple[dict[str, object], dict[str, str]]:
-    """Return the settings of a journal's file, and the values of one other block as text."""
+    """Return a journal's settings, of earlier versions too, and one other block as text."""
     root = _root(path)
-    return _settings(path, root), {
+    return _settings(path, root, without_removed=True), {
         name: node.value for mapping in _blocks(root, '').get(block, ())
         for name, node in _dotted_values(mapping, '') if isinstance(node.value, str)}
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 from odocal_ros.errors import BadConfig, similar_names
 from odocal_ros.safe_io.text_formats import is_frame, one_line
 
+REMOVED_GROUPS = {'projection'}      # of settings of earlier versions
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 
 
@@ -127,9 +128,10 @@ def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
     settings = settings_of(type(config))
     for name, value in changes.items():
         if name not in settings:
-            similar = similar_names(name, settings)
+            similar, group = similar_names(name, settings), name.partition('.')[0]
             hint = (f'did you mean {" or ".join(similar)}?' if similar else
-                    'docs/settings.md lists all')
+                    f'the settings {group}.* were removed; delete them'
+                    if group in REMOVED_GROUPS else 'docs/settings.md lists all')
             raise BadConfig(f'no setting {name!r}; {hint}')
         group, _, leaf = name.rpartition('.')
         groups.setdefault(group, {})[leaf] = settings[name].checked(value)

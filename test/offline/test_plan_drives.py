@@ -112,6 +112,7 @@ def test_the_plan_of_a_bag_uses_its_drive_and_fixes(tmp_path, capsys):
     assert str(tmp_path / 'none') in refused(capsys, '--bag', str(tmp_path / 'none'))
     (bag / 'journal.yaml').write_text(
         '/**/calibrator:\n  ros__parameters:\n    imu.grade: tactical\n'
+        '    projection.kind: leg\n'      # of an earlier version
         'odocal_journal:\n  ros__parameters:\n    leg_id: 1\n')
     assert plan_of(capsys, '--bag', str(bag))['sigmas']['imu_grade'] == 'tactical'
     given = plan_of(capsys, '--bag', str(bag), '--imu-grade', 'industrial')

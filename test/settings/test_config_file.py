@@ -63,6 +63,8 @@ def test_blocks_of_other_nodes_are_named_but_not_used(write, key):
 @pytest.mark.parametrize(('text', 'error', 'match'), [
     ('    leg.min_distnace: 5.0\n', BadConfig,
      r'line 3: no setting .* did you mean leg.min_distance'),
+    ('    projection:\n      kind: leg\n', BadConfig, "line 4: no setting 'projection.kind'; the "
+     r'settings projection.\* were removed; delete them$'),
     ('    leg: {min_distance: far}\n', BadConfig, "line 3: leg.min_distance: 'far' is not a num"),
     ('\n    leg.min_distance: 0.0\n', BadConfig, 'line 4: leg.min_distance = 0: required: 1 to 1'),
     ('    gnss.lever_arm: [1.0, 2.0]\n', BadConfig, 'line 3: gnss.lever_arm: 2 values; required: '
