@@ -182,10 +182,13 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'accelerated, or the wheel difference does not match the turn.',
         Code.TRAVEL_MISSING: 'Within a few seconds the odometer travelled less than the vehicle, '
         'which did not brake by 0.5 m/s^2. A sliding wheel brakes, a spinning one travels '
-        'farther, so no wheel slipped: the odometer lost travel, often at a start from rest.',
+        'farther, so no wheel slipped: the odometer lost travel, often at a start from rest. Or, '
+        'with a share of the path: at some speeds it counts less than at others, more than its '
+        'noise explains.',
         Code.TRAVEL_EXCESS: 'While the vehicle braked to a stop, the odometer counted more travel '
         'than the vehicle moved. Brakes cannot spin a wheel, so this is not slip. Likely, the '
-        'speed signal is held or late.',
+        'speed signal is held or late. Or, with a share of the path: at some speeds it counts '
+        'more than at others.',
         Code.SCALE_VARIES: 'The tyre radius grows with speed and temperature: the scale is not '
         'constant in this leg. The stated value is its mean over the path; `scale_by_speed` and '
         '`scale_by_time` are its slopes.',

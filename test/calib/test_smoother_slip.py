@@ -128,6 +128,23 @@ def test_travel_lost_by_a_counter_without_braking_is_not_slip():
     assert 'without braking' in reason_text(method, Code.TRAVEL_MISSING)
 
 
+@pytest.mark.parametrize('loss', [0.1, 0.03])
+def test_counts_lost_at_high_speed_are_an_error_of_the_scale(loss):
+    """A counter that loses some of the counts in the fastest 15 % of the time."""
+    drive, config, leg = made(**SHORT)
+    t, s = leg.travel.t, leg.travel.s
+    speed = np.convolve(np.gradient(s, t), np.ones(20) / 20, 'same')
+    is_fast = speed > np.quantile(speed, 0.85)
+    counted = np.cumsum(np.diff(s, prepend=s[0]) * np.where(is_fast, 1 - loss, 1.0))
+    lossy = replace(leg, travel=Travel(t, np.floor(counted + 0.5), leg.travel.quantum))
+    method = smooth(lossy, config)
+    found = method.estimates['scale_factor']
+    assert abs(found.value - drive.truth.scale * np.ptp(s) / np.ptp(counted)) < 2 * found.sigma
+    assert 'less than the vehicle moves, mostly at constant speed' in reason_text(
+        method, Code.TRAVEL_MISSING)
+    assert 'unexplained_travel' in {source.name for source in method.sources}
+
+
 @pytest.mark.parametrize('forward', [1.0, -1.0])
 @pytest.mark.parametrize(('begin', 'metres', 'acceleration', 'sign'), [
     (10.0, 0.5, 1.0, 0), (10.0, 0.5, -2.0, 0), (10.0, -0.5, 1.0, -1), (10.0, -0.5, 0.0, -1),

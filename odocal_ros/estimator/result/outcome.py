@@ -67,9 +67,14 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     """Return the result of a fit; ``fit.solved`` cannot be used afterwards."""
     marginals = fit.solved.marginals()
     factor, reasons = find_mismatch(problem, fit, config)
-    posterior = _posterior(problem, fit, factor)
+    # only the steps of a coarse speed are used, which do not show slip
+    slip_path = None if leg.uses_speed_steps else residuals.odometer_minus_ground_path(
+        fit, marginals)
+    unexplained = None if slip_path is None else residuals.find_unexplained_travel(fit, slip_path)
+    posterior = _posterior(problem, fit, factor, unexplained)
     sigma, grade = posterior.sigma, problem.grade if leg.has_accelerometer else None
-    slips, reasons_of_slips = _find_slips(leg, fit, marginals, sigma)
+    slips, reasons_of_slips = _find_slips(leg, fit, marginals, slip_path, sigma)
+    reasons += [unexplained.reason()] if unexplained else []
     reasons += reasons_of_slips
     reasons += remarks.remarks(problem, fit, sigma, posterior.sigma_ratio, config)
     estimates, refusals = _estimate(leg, fit, posterior, config)
@@ -97,10 +102,12 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
                         information)
 
 
-def _posterior(problem: Problem, fit: Fit, factor: float) -> _Posterior:
+def _posterior(problem: Problem, fit: Fit, factor: float,
+               unexplained: residuals.UnexplainedTravel | None) -> _Posterior:
     """Return covariance and sigmas of the constants, the errors beyond the fit included."""
     covariance = with_model_floor(fit.covariance * factor**2)
-    beyond_fit = remarks.find_errors_beyond_fit(problem, fit, np.sqrt(np.diag(covariance)))
+    beyond_fit = remarks.find_errors_beyond_fit(problem, fit, np.sqrt(np.diag(covariance)),
+                                                unexplained.share if unexplained else 0.0)
     for error in beyond_fit:
         covariance[error.constant, error.constant] += error.sigma**2
     return _Posterior(factor, covariance, np.sqrt(np.diag(covariance)),
@@ -172,14 +179,13 @@ def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
     return sources, information
 
 
-def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
+def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals, slip_path: Floats | None,
                 sigma: Floats) -> tuple[tuple[residuals.Slip, ...], list[Reason]]:
     """Return the slips, and the reasons that report them and a filter of the odometer."""
     filtered = remarks.filter_reasons(fit.state.constants[layout.ODO_LAG2], sigma[layout.ODO_LAG2])
-    if leg.uses_speed_steps:    # only the steps of a coarse speed are used, which do not show slip
+    if slip_path is None:
         return (), list(filtered)
     count_m = leg.travel.quantum * fit.state.scale
-    slip_path = residuals.odometer_minus_ground_path(fit, marginals)
     slips = residuals.find_slips(fit, slip_path, count_m)
     speed = np.einsum('ni,nij,j->n', fit.state.v_n, fit.state.C_nb, fit.state.forward)
     # 0: slip; else no force explains it: the odometer lost (-1) or added (1) the travel

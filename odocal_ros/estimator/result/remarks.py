@@ -39,10 +39,10 @@ MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 SPEED_SCALE_REMEDY = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
                       'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
                       'Use wheel pulses, or a wheel that is not driven.')
-# judgement: variance factor of a bias walk above which it has a step. Steps have 480 and more, 60
-# drives without steps at most 7.3 (docs/decisions/0016)
+# judgement: variance factor of a bias walk that is a step: 480 and more, without at most 7.3
+# (docs/decisions/0016)
 STEP_VARIANCE = 100.0
-MIN_REPORTED_CHANGE = 3e-4     # relative, rad; judgement, of scale and angles
+MIN_REPORTED_CHANGE = 3e-4      # relative, rad; judgement, of scale and angles
 # judgement: share and number of outliers among the fixes above which they are reported
 OUTLIER_SHARE, MIN_REPORTED_OUTLIERS = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
@@ -53,14 +53,13 @@ POSE_OUTLIER_REMEDY = (
     'Check the map and the source of positions for jumps. The comparison of track and fixes '
     'includes these positions.')
 LEVER_ARM_AXES = 'Axes: from base_link, x forward, y left, z up.'
-# other cause of a lever arm that deviates, by whether the axis is z
-OTHER_CAUSE = {
+OTHER_CAUSE = {     # of a lever arm that deviates, by whether the axis is z
     False: 'Slip in turns (skid steering, tracks) also shifts x and y; if that is the cause, keep '
            'the setting.',
     True: 'Body roll on soft springs also shifts z; if that is the cause, keep the setting.'}
-# advice by whether imu.lever_arm is set
-IMU_ARM = {False: 'An imu.lever_arm that is not set has the same effect: set it first.',
-           True: 'A wrong imu.lever_arm has the same effect: check it too.'}
+IMU_ARM = {     # by whether imu.lever_arm is set
+    False: 'An imu.lever_arm that is not set has the same effect: set it first.',
+    True: 'A wrong imu.lever_arm has the same effect: check it too.'}
 
 
 def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
@@ -69,9 +68,8 @@ def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
     if not (problem.leg.origin.is_local
             and contains_odometer(share, sigma[layout.FIX_BY_MOTION])):
         return 0.0
-    # the drift of the map is filtered together with the wheels, and not modelled. Within a time
-    # constant of the filter it cannot be distinguished from the wheel error, which is averaged
-    # over only duration / time constant samples
+    # the map's drift is filtered together with the wheels: within a time constant of the filter
+    # it looks like the wheel error, so that there are duration / time constant samples
     duration = problem.leg.t_stop - problem.leg.t_begin
     return float(abs(share) * np.sqrt(np.exp(c[layout.FIX_MOTION_TIME]) / duration))
 
@@ -84,17 +82,18 @@ class ErrorBeyondFit(NamedTuple):
     sigma: float
 
 
-def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[ErrorBeyondFit]:
-    """Return the errors that the fit does not contain; sigma : (M,) of the constants."""
+def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats,
+                           unexplained: float) -> list[ErrorBeyondFit]:
+    """Return errors; sigma : (M,) of the constants.   unexplained : share of the travel."""
     by_map = sigma_by_wheels_in_map(problem, fit.state.constants, sigma)
     has_height = problem.leg.origin.is_local or not np.isnan(problem.leg.fixes_n[:, 2]).all()
     by_height = 0.0 if has_height else HEIGHT_UNKNOWN / SEMI_MAJOR_AXIS
     # which of the two values a later drive has is unknown
-    of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size))
-                 for step in fit.constant_steps
-                 if step.constant != layout.LN_K and step.is_certain]
+    of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size)) for step in
+                 fit.constant_steps if step.constant != layout.LN_K and step.is_certain]
     of_scale = [ErrorBeyondFit(layout.LN_K, name, size) for name, size in (
-        ('wheels_in_positions', by_map), ('height', by_height)) if size]
+        ('wheels_in_positions', by_map), ('height', by_height),
+        ('unexplained_travel', unexplained)) if size]
     return of_scale + of_angles
 
 

@@ -8,7 +8,7 @@ A slip is a run of intervals in which the path of the wheel is an outlier.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from odocal_ros.data.arrays import blocks, Floats
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.equations import Weighted
 from odocal_ros.estimator.factors.gnss import Fixes
-from odocal_ros.estimator.factors.interval_noise import ABSENT_VARIANCE
+from odocal_ros.estimator.factors.interval_noise import ABSENT_VARIANCE, accelerating_and_turning
 from odocal_ros.estimator.factors.motion import D
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import Fit
@@ -148,6 +148,44 @@ def find_slips(fit: Fit, slip_path: Floats, count_m: float) -> tuple[Slip, ...]:
         if abs(metres) >= max(4 * np.sqrt(fit.levels['along'] * (t[end] - t[begin])), limit):
             slips.append(Slip(float(t[begin]), float(t[end] - t[begin]), metres))
     return tuple(sorted(slips, key=lambda s: -abs(s.metres)))
+
+
+class UnexplainedTravel(NamedTuple):
+    """Travel that the fit explains by noise of one sign, docs/method.md (S31)."""
+
+    metres: float       # travel of the vehicle minus travel of the odometer
+    sigmas: float       # in sigmas of the sum of noise without a sign
+    share: float        # > 0, of the path
+    is_steady: bool     # mostly at constant speed, not while accelerating or braking
+
+    def reason(self) -> Reason:
+        """Return TRAVEL_MISSING or TRAVEL_EXCESS."""
+        code, relation = (Code.TRAVEL_MISSING, 'less') if self.metres > 0 else (
+            Code.TRAVEL_EXCESS, 'more')
+        where = 'at constant speed' if self.is_steady else 'while accelerating or braking'
+        remedy = ('a counter that loses pulses, or a limited speed value, at some speeds'
+                  if self.metres > 0 else 'slip, or pulses that are counted twice')
+        return Reason(code, (
+            f'the odometer counts {abs(self.metres):.1f} m ({100 * self.share:.2g} % of the path) '
+            f'{relation} than the vehicle moves, mostly {where}: {abs(self.sigmas):.1f} sigma of '
+            f'its noise (limit {REMARK_SIGMAS:g}). The scale is that of the other seconds'),
+            f'Likely cause: {remedy}. Compare the odometer with the fixes at these speeds. The '
+            'uncertainty was increased.')
+
+
+def find_unexplained_travel(fit: Fit, slip_path: Floats) -> UnexplainedTravel | None:
+    """Return the unexplained travel, None without; slip_path : ``odometer_minus_ground_path``."""
+    # slips are outliers, and counted as such
+    rows, usual = fit.weighted[MotionRows], fit.variance_factors[:, 0] <= SLIP_VARIANCE
+    hard, _ = accelerating_and_turning(rows.motion)
+    by_state = np.where(usual, -slip_path, 0.0)
+    metres = float(by_state.sum())
+    sigmas = metres / float(np.linalg.norm(rows.along_sigma()[usual]))
+    path = float(np.linalg.norm(rows.motion.displacement, axis=1).sum())
+    if abs(sigmas) <= REMARK_SIGMAS:
+        return None
+    steady = abs(by_state[~hard].sum()) > abs(by_state[hard].sum())
+    return UnexplainedTravel(metres, sigmas, abs(metres) / path, bool(steady))
 
 
 def describe_slip_level(fit: Fit, marginals: JointMarginals, count_m: float) -> str:
