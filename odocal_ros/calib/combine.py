@@ -67,13 +67,10 @@ def last_leg_values(results: Sequence[MethodResult],
     """
     Return values that apply to single legs, such as gyro biases, from the last leg with a value.
 
-    combined : values that are left out, as they apply to all legs. The heading error in older
-    results applies to the start of a leg: a combination has none.
+    combined : values that are left out, as they apply to all legs.
     """
     values: dict[str, Estimate] = {}
     for name, e in (item for r in results for item in r.estimates.items()):
-        if name == 'heading_error':
-            e = Estimate(None, None, e.unit)
         if name not in combined and name != 'scale_ratio' and (
                 name not in values or e.value is not None):
             values[name] = e

@@ -20,7 +20,7 @@ from odocal_ros.output.stored import read_stored, Stored, stored_from
 from odocal_ros.output.value_text import ANGLES
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-# values of one drive (turn-on bias, its heading), or derived from another value
+# values of one drive (turn-on bias; its heading, in older results), or derived from another value
 NOT_COMPARED = {'scale_ratio', 'heading_error', 'gyro_bias_x', 'gyro_bias_y', 'gyro_bias_z'}
 SHOWN_FIRST = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'track_width',
                'yaw_mounting_angle', 'pitch_mounting_angle')

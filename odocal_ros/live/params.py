@@ -33,7 +33,7 @@ SCALE_UNIT = 'm/pulse, m/rad or 1'      # by the kind of odometer
 ESTIMATE_UNITS = {
     'scale_factor': SCALE_UNIT, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
     'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE_UNIT,
-    'scale_factor_right': SCALE_UNIT, 'heading_error': 'rad', 'track_width': 'm'}
+    'scale_factor_right': SCALE_UNIT, 'track_width': 'm'}
 # those in ``result.*`` of the odometry node, which restores more of a calibration
 ODOMETRY_UNITS = ESTIMATE_UNITS | {'scale_factor_as_sent': SCALE_UNIT} | {
     f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {

@@ -41,7 +41,7 @@ LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_
 NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, TRACK, LEGS, device_files.CONTROLLERS,
          device_files.DEVICES, device_files.TWIST, device_files.IMU_ERRORS}
 # parameters that the node declares also for one wheel, then unknown
-TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width')
+TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'track_width')
 AXES = 'xyz'
 IMU_FRAME = 'imu_link'      # REP-145, by default
 

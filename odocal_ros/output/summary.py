@@ -103,7 +103,7 @@ def _value_lines(calibration: result.Calibration, width: int) -> list[str]:
         angle = texts.finite_estimate(estimates, name)
         lines.append(_line(f'{label} mounting', _angle_text(angle, width)))
     lines += [*_largest_error_lines(calibration, width), *wheels.values(),
-              *_other_lines(estimates, wheels, width),
+              *_other_lines(estimates, wheels),
               *(_lever_arm_line(estimates, name, result.name_antenna(label, local), width)
                 for name, label in ARMS.items()),
               _gyro_scale_line(calibration), _gyro_bias_line(estimates),
@@ -126,17 +126,14 @@ def _scale_lines(calibration: result.Calibration) -> list[str]:
     return [*lines, _path_ratio_line(calibration, scale, as_sent)]
 
 
-def _other_lines(estimates: dict[str, result.Estimate], wheels: dict[str, str],
-                 width: int) -> list[str]:
+def _other_lines(estimates: dict[str, result.Estimate], wheels: dict[str, str]) -> list[str]:
     """Return the lines of the values that the other functions do not show."""
-    lines, note = [], '   heading error minus yaw mounting' * (width >= texts.WIDTH)
+    lines = []
     for name in estimates:
         estimate = texts.finite_estimate(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', result.AS_SENT, *texts.ANGLES, *BIASES,
                         *wheels) and name[:-2] not in ARMS and estimate.value is not None:
-            text = (f'{_angle_text(estimate, 0)}{note}' if name == 'heading_error'
-                    else texts.with_unit(estimate))
-            lines.append(_line(tables.source_label(name), text))
+            lines.append(_line(tables.source_label(name), texts.with_unit(estimate)))
     return lines
 
 

@@ -19,7 +19,7 @@ import ros_bags
 HEADING = 0.7           # rad; with a known heading the yaw is separable
 SETTINGS = {'alignment.heading_source': 'fixed', 'alignment.heading_sigma': 0.002}
 ESTIMATES = ['scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle']
-OF_TWO_WHEELS = ['scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width']
+OF_TWO_WHEELS = ['scale_factor_left', 'scale_factor_right', 'track_width']
 RESULTS = ([f'result.{name}{end}' for name in ESTIMATES + OF_TWO_WHEELS for end in ('', '_sigma')]
            + ['result.legs', 'result.valid', 'result.stamp', 'result.vehicle'])
 

@@ -49,8 +49,7 @@ def three_methods(calibration):
     wheels = MethodResult('wheels', (), {
         'scale_factor': Estimate(0.05001, 2e-6, 'm/pulse'),
         'scale_factor_left': Estimate(0.0499, 3e-6, 'm/pulse'),
-        'track_width': Estimate(1.52, 0.01, 'm'), 'heading_error': Estimate(0.01, 0.001, 'rad'),
-        'odometer_delay': Estimate(0.012, 0.003, 's')},
+        'track_width': Estimate(1.52, 0.01, 'm'), 'odometer_delay': Estimate(0.012, 0.003, 's')},
         ('scale_factor',), (Source('fixes', np.array([[2e-6]])),),
         {'budget': {'fixes': {'scale_factor': 2e-6, 'track_width': 0.01, 'shared': True}}})
     smoother = replace(base, name='smoother')

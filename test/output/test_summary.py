@@ -78,7 +78,7 @@ def test_lines_fit_a_narrow_terminal_and_keep_numbers_with_their_units(good):
     text = screen(whole(good), width=80)
     assert max(len(line) for line in text.splitlines()) <= 80
     for part in ('0.0500000 ± 0.0000012 m/pulse', '-1.0000 ± 0.0029 deg', 'wheels', 'WHEEL_SLIP',
-                 'error budget', 'TOPIC_GAP: a gap of 3 s', '08:53:20', 'heading error'):
+                 'error budget', 'TOPIC_GAP: a gap of 3 s', '08:53:20', 'track width'):
         assert part in text, part
 
 
@@ -161,14 +161,6 @@ def test_checks_of_legs_are_pooled_by_their_number_of_fixes():
     assert pooled_check([]) is None
 
 
-def test_the_heading_error_of_wheels_is_labelled_as_minus_yaw_mounting(good):
-    more = {'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels')}
-    text = screen(replace(good, estimates=good.estimates | more))
-    (line,) = (line for line in text.splitlines() if 'heading error' in line)
-    assert '-0.957 ± 0.029 deg' in line
-    assert line.endswith('heading error minus yaw mounting')
-
-
 def test_the_coordinates_of_a_lever_arm_are_on_one_line(good):
     arm = {f'odometer_lever_arm_{axis}': Estimate(value, sigma, 'm') for axis, value, sigma in (
         ('x', -0.0058, 0.0031), ('y', None, None), ('z', 0.25, 0.06))}
@@ -189,7 +181,7 @@ def whole(good):
                          'words than fit on a line') for n in range(4))
     return replace(good, methods=methods, reasons=(Reason(Code.WHEEL_SLIP, 'it spun'), *notes),
                    estimates=good.estimates | {
-                       'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels')})
+                       'track_width': Estimate(1.52, 0.01, 'm', 'smoother')})
 
 
 def test_a_terminal_with_few_rows_omits_details_that_the_report_has(good):

@@ -68,10 +68,8 @@ class SearchResult:
         return {
             'ranges': ranges,
             'array': {'name': self.array_name, 'rows': len(self.sets),
-                      'imbalance': 0.0,
                       'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
             'best_row': _set(self.sets[self.best]) | self.scores.row(self.best),
-            'meets_accuracy': None,
             'left_and_right_held_together': self.fixed_difference,
             'heading_means': HEADING_MEANS,
             'response_surface': _set(self.refined_set) | {
