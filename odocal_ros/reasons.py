@@ -98,6 +98,8 @@ class Code(Enum):
                                      'looks like this: then set imu.gyro_scale.')
     IMU_SATURATED = NOTE, ('Set a larger range in the IMU or its driver, or mount it more softly. '
                            'The mean of a saturated axis is wrong.')
+    GYRO_DEAD_BAND = CAUTION, ('Switch off the dead band of the IMU or its driver (a zero-rate '
+                               'filter), and drive again.')
     IMU_BIAS_STEP = NOTE, ('No action needed for this leg. Check that the IMU is firmly mounted '
                            'and its supply is stable; if the bias steps in each drive, replace '
                            'the IMU.')

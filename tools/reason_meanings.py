@@ -116,6 +116,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.IMU_SATURATED: 'The largest value of an axis is repeated: the sensor stops at the '
         'limit of its range, 2 g or 16 g for an accelerometer. Potholes and a hard mount cause '
         'this. The noise levels include these samples.',
+        Code.GYRO_DEAD_BAND: 'Some IMUs and drivers send 0 for small turn rates, so that a '
+        'vehicle at rest does not turn. The small rates of slopes, banks and gentle bends are '
+        'then lost, and yaw and pitch can be wrong by several sigma.',
         Code.IMU_BIAS_STEP: 'The bias of the gyro or of the accelerometer changes within a second '
         'or two by more than 10 times its usual change: a knock, a strained board or a change of '
         'the supply. The bias is estimated before and after; values and sigmas hold.',

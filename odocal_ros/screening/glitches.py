@@ -24,6 +24,7 @@ from odocal_ros.data.arrays import (
     median,
     reduce_columns,
     runs,
+    thinned,
 )
 from odocal_ros.data.samples import HeadingSamples, ImuSamples
 from odocal_ros.nav.odometer import Travel
@@ -55,6 +56,9 @@ ROLLING_SHARE = 0.1               # of the top speed: least mean speed of a movi
 MIN_GYRO_RANGE, MIN_ACCELEROMETER_RANGE = 1.0, 1.5 * G      # rad/s, m/s^2
 # statistical: coarse steps also repeat the largest value, but less often than the next smaller one
 MIN_AT_LIMIT, TIMES_NEXT = 5, 3.0
+# judgement, of a dead band of the gyro: least share of zeros in motion, least number of different
+# rates up to twice the smallest one (coarse steps have one), and rows that are tested
+ZERO_SHARE, MIN_NEXT_RATES, DEAD_BAND_ROWS = 0.05, 5, 200_000
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
@@ -188,8 +192,8 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
     Return IMU_GAP if the gyro repeats exactly one value while the wheels roll.
 
     t, w : (n,) s, (n, 3) rad/s.   travel : of the odometer.   limit : s, longest allowed gap.
-    Accepted are a gyro that measures zero (some drivers have a dead band) and one that often
-    repeats its value (coarse steps).
+    Accepted are a gyro that measures zero (``dead_band_reasons``) and one that often repeats its
+    value (coarse steps).
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()
@@ -209,6 +213,32 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
     return (Reason(Code.IMU_GAP, 'the gyro repeats one value for '
                    f'{end[worst] - begin[worst]:.2f} s at t = {begin[worst]:.2f} s while the '
                    'wheels turn: its output is frozen'),)
+
+
+def dead_band_reasons(t: Floats, w: Floats, travel: Travel) -> tuple[Reason, ...]:
+    """
+    Return GYRO_DEAD_BAND if the gyro sends 0 for small turn rates while the wheels roll.
+
+    t, w : (n,) s, (n, 3) rad/s.   travel : of the odometer.
+    """
+    if len(t) < 2 or len(travel.t) < 2:
+        return ()
+    t, w = thinned(t, DEAD_BAND_ROWS), thinned(w, DEAD_BAND_ROWS)
+    second = np.arange(t[0], t[-1] + 1.0)
+    speed = np.abs(np.diff(travel.at(second), append=travel.s[-1]))
+    rolls = np.interp(t, second + 0.5, speed) > ROLLING_SHARE * np.percentile(speed, 95)
+    found = []
+    for axis, x in zip('xyz', np.abs(w[rolls]).T, strict=True):
+        smallest = np.min(x, where=x > 0, initial=np.inf)
+        zeros = float((x == 0).mean()) if len(x) else 0.0
+        next_rates = np.unique(np.round(x[(x > 0) & (x < 2 * smallest)] / smallest, 2))
+        if zeros > ZERO_SHARE and len(next_rates) >= MIN_NEXT_RATES:
+            found.append((zeros, axis, np.rad2deg(smallest)))
+    if not found:
+        return ()
+    zeros, axis, limit_deg = max(found)
+    return (Reason(Code.GYRO_DEAD_BAND, f'the gyro sends 0 for turn rates below {limit_deg:.2g} '
+                   f'deg/s, axis {axis} in {100 * zeros:.0f} % of the messages in motion'),)
 
 
 def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,

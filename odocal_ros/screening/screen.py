@@ -71,6 +71,7 @@ def screen(leg: Leg, config: Config,
         reasons += alternating_imu_reasons(imu.w_i, imu.f_i)
         reasons += glitches.saturation_reasons(t_imu, imu.w_i, imu.f_i, config.imu)
         reasons += glitches.frozen_gyro_reasons(t_imu, imu.w_i, wheels.mean, config.leg.max_gap)
+        reasons += glitches.dead_band_reasons(t_imu, imu.w_i, wheels.mean)
         # one axle is only tested with an accelerometer
         if len(wheels.wheels) > (1 if inputs.has_accelerometer else len(SIDES)):
             wheels, axle_reasons = usable_axles(

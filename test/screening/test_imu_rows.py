@@ -7,10 +7,11 @@ from drives import drive, seconds, with_columns
 import numpy as np
 import pytest
 
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code
 from odocal_ros.screening.even_imu_times import even_imu_times
-from odocal_ros.screening.glitches import saturation_reasons
+from odocal_ros.screening.glitches import dead_band_reasons, saturation_reasons
 from odocal_ros.screening.imu_faults import alternating_imu_reasons
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, ImuConfig
@@ -191,3 +192,30 @@ def test_a_spike_is_not_a_second_imu(leg):
     w = leg.imu.w_i.copy()
     w[len(w) // 2] += 50.0
     assert not alternating_imu_reasons(w, leg.imu.f_i)
+
+
+def rates(kind, rng):
+    """Return the rates of a gyro, (n, 3) rad/s, and the travel, with stops of 50 of 100 s."""
+    moves = T % 100.0 < 50.0
+    w = np.deg2rad(0.5) * rng.standard_normal((N, 3)) * [0.3, 1.0, 3.0]
+    travel = Travel(T, np.cumsum(np.where(moves, 0.1, 0.0)), 0.0)
+    band = np.deg2rad(0.3)
+    if kind == 'dead band':
+        w[np.abs(w) < band] = 0.0
+    elif kind == 'coarse steps':
+        w = band * np.round(w / band)
+    elif kind == 'zero at rest':
+        w[~moves] = 0.0
+    elif kind == 'yaw only':
+        w[:, :2] = 0.0
+    return w, travel
+
+
+@pytest.mark.parametrize('kind', ['', 'dead band', 'coarse steps', 'zero at rest', 'yaw only'])
+def test_a_gyro_without_small_rates_in_motion_has_a_dead_band(rng, kind):
+    reasons = dead_band_reasons(T, *rates(kind, rng))
+    assert [r.code for r in reasons] == [Code.GYRO_DEAD_BAND] * (kind == 'dead band')
+    if reasons:
+        # of x, with a sigma of 0.15 deg/s: two sigma
+        assert reasons[0].text == ('the gyro sends 0 for turn rates below 0.3 deg/s, axis x in '
+                                   '95 % of the messages in motion')
