@@ -87,7 +87,7 @@ def run_drive(seed):
     from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.settings.config import with_settings
     from odocal_ros.sim.scenarios import simulate
-    from odocal_ros.sim.wheels import effective_width, SIDEWAYS
+    from odocal_ros.sim.wheels import effective_width, LATERAL_RATIO
     drive = simulate(options_of(seed))
     config = with_settings(configured(drive), {'odometer.track_width': 0.0})
     calibration = combine([calibrate(drive.leg(), config)], config)
@@ -99,7 +99,7 @@ def run_drive(seed):
     truth, found = drive.truth, calibration.estimates
     width = effective_width(drive.options)
     arc = effective_width(drive.options, 2 * width)
-    lateral = SIDEWAYS * truth.scale
+    lateral = LATERAL_RATIO * truth.scale
     for key, name, true, size in (
             ('scale', 'scale_factor', truth.scale, truth.scale),
             ('width', 'track_width', width, width),

@@ -225,7 +225,7 @@ def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
         """Return the variance of the slip of one wheel per metre of its path."""
         metres = (path[rows] + 0.1 * MOTION_STEP).sum() if rows.any() else 1.0
         return float(robot.slip**2 * max(rows.sum(), 1) * MOTION_STEP / metres)
-    table = (run.wheels.body_by_wheel**2).sum(1) * len(run.wheels.rows) / robot.wheels
+    table = (run.wheels.wheels_to_body**2).sum(1) * len(run.wheels.rows) / robot.wheels
     side = level(moving) * table[1] if robot.drive in settings.HOLONOMIC else NO_SIDE_SLIP
     levels = {'along': level(moving) * table[0], 'turn': level(moving & ~spins) * table[2],
               'spin': level(spins) * table[2], 'drift': robot.drift**2, 'side': side,

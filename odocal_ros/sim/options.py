@@ -89,28 +89,30 @@ class SimOptions:
     odometer_delay: float = 0.0            # s, delay of the stamps
     odometer_lever_arm: Vector = ZEROS3     # wheel contact point; of two wheels: their middle
     scale: float = BY_SCENARIO             # m/pulse, 1 or m/rad: the true value
-    nominal_scale: float = BY_SCENARIO     # K0, configured by the operator
-    speed_noise: float = 0.0               # m/s, white, of kind speed
+    nominal_scale: float = BY_SCENARIO     # as configured by the operator
+    speed_noise: float = 0.0               # m/s, white; only for odometer = speed
     drive: str = DIFFERENTIAL              # of a robot: or skid, mecanum, omni
     two_wheels: bool = False               # as wheels = 2
     wheels: int = BY_SCENARIO              # more than 2: joints of one JointState
-    wheel_difference: float = 0.004        # K_right / K_left - 1; of more wheels 1 sigma each
+    # K_right / K_left - 1; for more than 2 wheels: sigma of the relative scale error of each
+    wheel_difference: float = 0.004
     wheelbase: float = 2.7                 # m, from the odometer's point to the front axle
-    front_steers: bool = True              # of more than 2 wheels the front ones steer
+    front_steers: bool = True              # more than 2 wheels: the front ones steer
     track_width: float = BY_SCENARIO       # m
     slip_walk: float = 0.0                 # m/sqrt(s) while moving
     slip_events: float = 0.0               # per hour of motion
     slip_size: float = 0.1                 # m spun in each event
     start_slip: float = 0.0                # wheel spin as a fraction of travel after each start
     start_slip_time: float = 5.0           # s from each start on
-    sway: float = 0.0                      # m/s of side and up while moving, white at 10 Hz
+    # m/s, lateral and vertical velocity noise while moving; white, sampled at 10 Hz
+    sway: float = 0.0
 
-    # fix (NavSatFix) or a position in a local frame; the next seven have its usual values
+    # name in REFERENCES, which has defaults of the next seven; others are in COMMON_DEFAULTS
     reference: str = BY_SCENARIO
     fix_rate: float = BY_SCENARIO          # Hz
     fix_noise: str = BY_SCENARIO           # white, correlated or rtk
     fix_sigma: float = BY_SCENARIO   # m, horizontal, each axis; up: twice
-    fix_correlation_time: float = BY_SCENARIO    # s, of kind correlated
+    fix_correlation_time: float = BY_SCENARIO    # s, only for fix_noise = correlated
     reference_drift: float = BY_SCENARIO   # m/sqrt(m) of path
     drift_length: float = BY_SCENARIO      # m of path, correlation length; 0: random walk
     closure_time: float = BY_SCENARIO      # s, mean, between loop closures; 0: none
@@ -184,16 +186,16 @@ ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0,
 
 def resolved(options: SimOptions) -> SimOptions:
     """Return options with the scenario's own values; BadUsage for a wrong name or value."""
-    _choice('--scenario', options.scenario, DEFAULTS)
-    _choice('--odometer', options.odometer, ODOMETERS)
+    _check_choice('--scenario', options.scenario, DEFAULTS)
+    _check_choice('--odometer', options.odometer, ODOMETERS)
     defaults: dict[str, Any] = COMMON_DEFAULTS | DEFAULTS[options.scenario]
-    _choice('--reference', options.reference or defaults['reference'], REFERENCES)
+    _check_choice('--reference', options.reference or defaults['reference'], REFERENCES)
     defaults |= REFERENCES[options.reference or defaults['reference']].options
     options = _with_defaults(options, defaults)
-    _choice('--fix-noise', options.fix_noise, FIX_NOISES)
-    _choice('--drive', options.drive, DRIVES)
+    _check_choice('--fix-noise', options.fix_noise, FIX_NOISES)
+    _check_choice('--drive', options.drive, DRIVES)
     if options.drive != DIFFERENTIAL:
-        _choice(f'--drive {options.drive}: --scenario', options.scenario, ROBOTS)
+        _check_choice(f'--drive {options.drive}: --scenario', options.scenario, ROBOTS)
         options = replace(options, front_steers=False, wheelbase=options.track_width,
                           wheels=4 if options.drive == MECANUM else options.wheels)
     if options.drive == OMNI:
@@ -202,7 +204,7 @@ def resolved(options: SimOptions) -> SimOptions:
         options = replace(options, odometer='angle')
     scale, nominal = (INDOOR_SCALES if options.scenario in ROBOTS else SCALES)[options.odometer]
     if options.scenario == 'paper':
-        # fine pulses: a coarser one would hide 1e-6 of 11 200 m
+        # fine pulses: quantisation must stay below 1e-6 of the 11.2 km path
         scale = 0.001 if options.odometer == 'counts' else scale
         nominal = 1.2 * (options.scale or scale)
     elif options.scale is not None:
@@ -221,7 +223,7 @@ def _with_defaults(options: SimOptions, values: dict[str, Any]) -> SimOptions:
 
 
 def _check(options: SimOptions) -> None:
-    _choice('--imu-grade', options.imu_grade, SIM_GRADES)
+    _check_choice('--imu-grade', options.imu_grade, SIM_GRADES)
     for option in fields(options):
         value = getattr(options, option.name)
         for number in value if isinstance(value, tuple) else (value,):
@@ -255,6 +257,6 @@ def _check_number(name: str, value: float) -> None:
         raise BadUsage(f'{flag} {shown:g}: the limit is {limit:g}')
 
 
-def _choice(flag: str, name: str, names: Collection[str]) -> None:
+def _check_choice(flag: str, name: str, names: Collection[str]) -> None:
     if name not in names:
         raise BadUsage(f'{flag} {name}: {unknown_name(name, names)}')

@@ -15,7 +15,7 @@ from odocal_ros.settings.config import DIFFERENTIAL, MECANUM, SIDES, SKID
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import Drive
-from odocal_ros.sim.wheels import effective_width, SIDEWAYS, wheels_of
+from odocal_ros.sim.wheels import effective_width, LATERAL_RATIO, wheels_of
 
 BEST_GRADE = 'navigation'   # in the settings of a perfect IMU
 
@@ -35,13 +35,12 @@ def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
         **_robot_entries(options),
         'yaw_mounting_deg': {'value': math.degrees(truth.yaw)},
         'pitch_mounting_deg': {'value': math.degrees(truth.pitch)},
-        # the angles above are those of the sensor axes, these of the housing: equal if the axes
-        # are perpendicular
+        # above: sensor axes; below: housing. Both are equal if the axes are perpendicular
         'yaw_mounting_housing_deg': {'value': math.degrees(truth.yaw_housing)},
         'pitch_mounting_housing_deg': {'value': math.degrees(truth.pitch_housing)},
         'roll_mounting_deg': {'value': math.degrees(options.roll)},
         'nominal_rpy_deg': [math.degrees(a) for a in options.mounting_rpy],
-        # of the body frame's x axis, clockwise from north, at the start mark
+        # direction of the body frame's x axis, clockwise from north, at the start mark
         'heading': {'rad': truth.heading, 'deg': math.degrees(truth.heading)},
         'distance': {'value': truth.distance, 'unit': 'm'},
         'marks': {'start_ns': truth.start_ns, 'stop_ns': truth.stop_ns},
@@ -52,7 +51,7 @@ def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
         'gyro_bias': {'value': truth.gyro_bias.tolist(), 'unit': 'rad/s, imu frame, at turn-on'},
         'accel_bias': {'value': truth.accel_bias.tolist(),
                        'unit': 'm/s^2, imu frame, at turn-on'},
-        'options': _plain(asdict(options)),
+        'options': _tuples_to_lists(asdict(options)),
     }
 
 
@@ -69,7 +68,7 @@ def _topics(drive: Drive) -> dict[str, Any]:
 
 
 def _wheels(drive: Drive) -> dict[str, Any]:
-    """Return the truth of each of several wheels: factor, position in base_link, steering."""
+    """Return the truth of each wheel, if several: factor, position in base_link, steering."""
     wheels = wheels_of(drive.options)
     return {'wheels': {wheel.name: {'scale_factor': scale, 'position': wheel.arm.tolist(),
                                     'steered': wheel.steered}
@@ -84,17 +83,17 @@ def _robot_entries(options: SimOptions) -> dict[str, Any]:
     width = effective_width(options)
     entries = {'track_width': width}
     if options.drive == MECANUM:
-        entries |= {'lateral_scale_factor': SIDEWAYS * options.scale}
+        entries |= {'lateral_scale_factor': LATERAL_RATIO * options.scale}
     elif options.drive == SKID:
         entries |= {'track_width_arc': effective_width(options, radius=2 * width)}
     return {'robot': entries}
 
 
-def _plain(value: Any) -> Any:
-    """Return tuples as lists: YAML has no tuples."""
+def _tuples_to_lists(value: Any) -> Any:
+    """Return a value with lists in place of tuples, which YAML does not have."""
     if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, tuple) else value
+        return {key: _tuples_to_lists(v) for key, v in value.items()}
+    return [_tuples_to_lists(v) for v in value] if isinstance(value, tuple) else value
 
 
 def _configured_arm(options: SimOptions, name: str) -> list[float]:
@@ -133,7 +132,7 @@ def operator_settings(drive: Drive, known_heading_sigma: float | None = None,
 
 
 def topic_arguments(drive: Drive) -> list[str]:
-    """Return the topic options that replay needs if several topics have the same type."""
+    """Return command-line arguments of replay: the topics, if several have the same type."""
     arguments = []
     if len(drive.wheels) > 1 and drive.options.odometer == 'counts':
         arguments += ['--odometer-topic', '/odometer/left',

@@ -26,7 +26,7 @@ AXLES = {1: ('rear',), 2: ('front', 'rear'), 3: ('front', 'middle', 'rear'),
 # of skid steering: effective over geometric track width in a turn on the spot and straight on.
 # Judgement: published centres of rotation are 1.3 to 2 times as far apart as the wheels
 SPOT_RATIO, STRAIGHT_RATIO = 1.7, 1.4
-SIDEWAYS = 0.95     # judgement: sideways motion over rolled path of mecanum wheels: rollers slip
+LATERAL_RATIO = 0.95     # judgement: sideways motion over rolled path of mecanum wheels, by slip
 ROLLING_RESISTANCE = 0.01    # physical: rolling resistance over load, of tyres on asphalt
 AIR_DRAG = 1e-5              # judgement: air drag over load, per (m/s)^2
 
@@ -75,7 +75,7 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
 
 
 def _scales(options: SimOptions, counted: Bools) -> list[float]:
-    """Return the factors of more than two wheels, drawn; counted : (n,) those of the mean."""
+    """Return random scales of more than two wheels; counted : (n,) wheels in the mean."""
     n = len(counted)
     scales = 1 + options.wheel_difference * make_rng(options.seed, 'wheels').standard_normal(n)
     scales *= options.scale * np.mean(1 / scales[counted])
@@ -113,7 +113,7 @@ def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
         return np.asarray((y * state.travel - x * lateral) / radius - radius * state.turned)
     side = -1.0 if y > 0 else 1.0       # left, right
     if options.drive == MECANUM:
-        lateral = running_integral(state.t, state.sway[:, 0]) / SIDEWAYS
+        lateral = running_integral(state.t, state.sway[:, 0]) / LATERAL_RATIO
         rollers = side if wheel.name.startswith('front') else -side
         return (state.travel + rollers * lateral
                 + side * effective_width(options) / 2 * state.turned)

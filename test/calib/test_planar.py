@@ -128,7 +128,7 @@ def test_wheels_that_differ_by_a_few_per_cent_do_not_affect_the_scale(monkeypatc
 def test_wheel_table_inverts_the_wheel_rows(kind):
     """The table is the pseudo-inverse of the rows: numpy.linalg.pinv."""
     rows = wheel_rows(kind, 5, 0.3)
-    table = Wheels(np.zeros((1, len(rows))), rows, kind).body_by_wheel
+    table = Wheels(np.zeros((1, len(rows))), rows, kind).wheels_to_body
     assert_allclose(table, np.linalg.pinv(rows) * [[1], [1], [2]], atol=1e-12)
 
 

@@ -24,7 +24,7 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 from odocal_ros.sim.truth import operator_settings
-from odocal_ros.sim.wheels import effective_width, SIDEWAYS
+from odocal_ros.sim.wheels import effective_width, LATERAL_RATIO
 
 ROOT = Path(__file__).resolve().parents[2]
 TEST = ROOT / 'test'
@@ -52,7 +52,7 @@ def test_values_are_within_their_sigmas(drive, wheels):
     estimates = found.methods['planar'].estimates
     width = effective_width(made.options)
     truth = {'scale_factor': made.truth.scale, 'track_width': width, 'rotation_lever': width / 2,
-             'lateral_scale_factor': SIDEWAYS * made.truth.scale,
+             'lateral_scale_factor': LATERAL_RATIO * made.truth.scale,
              'track_width_arc': effective_width(made.options, 2 * width)}
     names = {'differential': ['track_width'], 'skid': ['track_width', 'track_width_arc'],
              'mecanum': ['rotation_lever', 'lateral_scale_factor'],

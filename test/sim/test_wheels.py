@@ -51,7 +51,7 @@ def test_mecanum_wheels_obey_their_kinematics_and_move_sideways():
     lateral = np.append(0.0, np.cumsum(0.01 * (state.sway[1:, 0] + state.sway[:-1, 0]) / 2))
     assert lateral.max() > 1.0
     assert_allclose((fl + fr + rl + rr) / 4, state.travel, atol=1e-9)
-    assert_allclose((-fl + fr + rl - rr) / 4, lateral / wheels.SIDEWAYS, atol=1e-9)
+    assert_allclose((-fl + fr + rl - rr) / 4, lateral / wheels.LATERAL_RATIO, atol=1e-9)
     assert_allclose((-fl + fr - rl + rr) / 4,
                     wheels.effective_width(made.options) / 2 * state.turned, atol=1e-9)
     made = robot(drive='mecanum', reference='mocap')

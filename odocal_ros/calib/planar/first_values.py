@@ -43,7 +43,7 @@ def first_values(run: Run, width: float) -> FirstValues:
 
     Dead-reckoned paths for each of WIDTHS and RATIOS, in windows of WINDOW or WINDOW_STEPS steps
     between positions, are rotated and scaled onto the positions. Turns on the spot by 90 deg and
-    by 450 deg look the same: of several minima that fit about equally well, the one nearest to the
+    by 450 deg look the same: if several minima fit about equally well, the one nearest to the
     configured width is used; without a configured width the largest, with the smallest turns.
     """
     # imported here: the start of a node does not need it

@@ -15,8 +15,8 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.settings.config import MECANUM, OMNI, SKID
 
-# definition: rows of wheels, metres rolled per metre forward, per metre left, and per turn that
-# moves a wheel at the lever (half the track width; for mecanum plus half the wheelbase) by a metre
+# definition: rows: wheels; columns: wheel travel per metre forward, per metre left, and per metre
+# of lever times turn. Lever: half the track width; mecanum: plus half the wheelbase
 SIDE_ROWS = np.array([[1.0, 0.0, -1.0], [1.0, 0.0, 1.0]])
 # definition: front left, front right, rear left, rear right
 MECANUM_ROWS = np.array([[1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
@@ -58,28 +58,28 @@ class Wheels:
                 *{SKID: ('arc',), MECANUM: ('lateral',)}.get(self.kind, ()))
 
     @property
-    def body_by_wheel(self) -> Floats:
-        """Return forward, left, and width times turn per metre of each wheel: (3, w)."""
+    def wheels_to_body(self) -> Floats:
+        """Return pseudo-inverse of ``rows``, (3, w): wheels to forward, left, width times turn."""
         shares: Floats = self.rows / np.maximum((self.rows**2).sum(0), 1e-12)
         return np.asarray((shares * np.array([1.0, 1.0, 2.0])).T)
 
     def body_motion(self, metres: Floats) -> Floats:
-        """Return forward, left, and width times turn by metres of the wheels, (n, w): (n, 3)."""
+        """Return forward, left, track width times turn, (n, 3) m, from wheel travel, (n, w) m."""
         # not by BLAS: its last bits depend on the number of rows
-        return np.asarray(np.einsum('kw,iw->ki', metres, self.body_by_wheel))
+        return np.asarray(np.einsum('kw,iw->ki', metres, self.wheels_to_body))
 
     @property
     def path(self) -> Floats:
         """Return the path of a wheel, mean of both sides, plus sideways motion: (n,)."""
-        forward, side, wheel_difference = self.body_motion(self.count).T
+        forward, sideways, wheel_difference = self.body_motion(self.count).T
         rolled = np.maximum(np.abs(forward), np.abs(wheel_difference) / 2)
-        return np.asarray(rolled + np.abs(side))
+        return np.asarray(rolled + np.abs(sideways))
 
     @property
     def turns_on_spot(self) -> Bools:
         """Return True for intervals with more turn than travel: (n,)."""
-        forward, side, wheel_difference = np.abs(self.body_motion(self.count)).T
-        return np.asarray(wheel_difference > 2 * (forward + side))
+        forward, sideways, wheel_difference = np.abs(self.body_motion(self.count)).T
+        return np.asarray(wheel_difference > 2 * (forward + sideways))
 
     @property
     def straightness(self) -> Floats:
@@ -88,55 +88,58 @@ class Wheels:
         larger = np.maximum(2 * forward, wheel_difference)
         return 1 - np.where(larger > 0, wheel_difference / np.maximum(larger, 1e-30), 1.0)
 
-    def increments(self, c: Floats) -> tuple[Floats, Floats]:
+    def increments(self, constants: Floats) -> tuple[Floats, Floats]:
         """
-        Return forward, left and turn of each interval, (n, 3) m, m, rad, and derivatives by c.
+        Return forward, left and turn of each interval, (n, 3) m, m, rad, and derivatives.
 
-        c : (m,) scale of each wheel, one over the track width (twice the lever); for skid steering
-        the increase of one over the width from turns on the spot to a straight line; for mecanum
-        wheels the ratio of motion to rolling sideways.
+        constants : (m,) scale of each wheel; 1 / track width (twice the lever); skid: increase of
+        1 / width from turns on the spot to a straight line; mecanum: ratio of sideways motion to
+        rolled path.   derivatives : by constants, (n, 3, m).
         """
-        w, body_by_wheel = self.count.shape[1], self.body_by_wheel
-        scale, inverse_width, side = self._split_constants(c)
+        w, wheels_to_body = self.count.shape[1], self.wheels_to_body
+        scale, inverse_width, lateral_ratio = self._split_constants(constants)
         forward, rolled, wheel_difference = self.body_motion(self.count * scale).T
         J = np.zeros((len(self.count), 3, len(self.names)))
-        J[:, 0, :w] = self.count * body_by_wheel[0]
-        J[:, 1, :w] = self.count * body_by_wheel[1] * side
-        J[:, 2, :w] = self.count * body_by_wheel[2] * inverse_width[:, None]
+        J[:, 0, :w] = self.count * wheels_to_body[0]
+        J[:, 1, :w] = self.count * wheels_to_body[1] * lateral_ratio
+        J[:, 2, :w] = self.count * wheels_to_body[2] * inverse_width[:, None]
         J[:, 2, w] = wheel_difference
         if self.kind == SKID:
             J[:, 2, w + 1] = wheel_difference * self.straightness
         if self.kind == MECANUM:
             J[:, 1, w + 1] = rolled
-        return np.stack([forward, rolled * side, wheel_difference * inverse_width], -1), J
+        return np.stack([
+            forward, rolled * lateral_ratio, wheel_difference * inverse_width], -1), J
 
-    def _split_constants(self, c: Floats) -> tuple[Floats, Floats, float]:
-        """Return scales (w,), inverse widths (n,), and the ratio of motion to rolling sideways."""
+    def _split_constants(self, constants: Floats) -> tuple[Floats, Floats, float]:
+        """Return scales (w,), inverse widths (n,), ratio of sideways motion to rolled path."""
         w, n = self.count.shape[1], len(self.count)
-        inverse_width = np.full(n, c[w]) + (c[w + 1] * self.straightness if self.kind == SKID
-                                            else 0.0)
-        return c[:w], inverse_width, float(c[w + 1]) if self.kind == MECANUM else 1.0
+        inverse_width = np.full(n, constants[w]) + (
+            constants[w + 1] * self.straightness if self.kind == SKID else 0.0)
+        lateral_ratio = float(constants[w + 1]) if self.kind == MECANUM else 1.0
+        return constants[:w], inverse_width, lateral_ratio
 
-    def gains(self, c: Floats) -> tuple[Floats, Floats]:
+    def gains(self, constants: Floats) -> tuple[Floats, Floats]:
         """
-        Return the gains from wheels to forward, left and turn, (n, 3), and derivatives by c.
+        Return the body motion (forward, left, turn) per count of wheel slip, and its derivatives.
 
-        Slip is an error of the wheels: residuals of a body increment are divided by its gain, so
-        that the noise of a wheel does not bias its factor (errors in variables).
+        (n, 3) and, by constants, (n, 3, m). Residuals are divided by it, so that wheel noise does
+        not bias the scales (errors in variables).
         """
         w = self.count.shape[1]
-        scales, inverse_width, side = self._split_constants(c)
+        scales, inverse_width, lateral_ratio = self._split_constants(constants)
         scale = scales.sum() / w
         J = np.zeros((len(self.count), 3, len(self.names)))
-        J[:, 0, :w], J[:, 1, :w], J[:, 2, :w] = 1 / w, side / w, inverse_width[:, None] / w
+        J[:, 0, :w], J[:, 1, :w] = 1 / w, lateral_ratio / w
+        J[:, 2, :w] = inverse_width[:, None] / w
         J[:, 2, w] = scale
         if self.kind == SKID:
             J[:, 2, w + 1] = scale * self.straightness
         if self.kind == MECANUM:
             J[:, 1, w + 1] = scale
         return np.stack([np.full_like(inverse_width, scale),
-                         np.full_like(inverse_width, scale * side), inverse_width * scale],
-                        -1), J
+                         np.full_like(inverse_width, scale * lateral_ratio),
+                         inverse_width * scale], -1), J
 
     def prior(self, left: float, right: float, width: float) -> tuple[Floats, Floats]:
         """Return prior values (m,) and covariance (m, m) from the first values of a run."""
@@ -174,7 +177,8 @@ class Run:
 class PriorKnowledge:
     """Prior knowledge of a run; sigmas are 1 sigma, in SI units."""
 
-    width: float = 0.0          # m, track width, 0 unknown; of several minima the nearest is used
+    # m, track width; 0: unknown. If the fit has several minima, the one nearest to it is used
+    width: float = 0.0
     offset: tuple[float, float] = (0.0, 0.0)  # m, tracked point ahead and left of the wheels
     offset_sigma: float = 0.1
     delay_sigma: float = 0.05
