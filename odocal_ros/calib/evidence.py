@@ -59,22 +59,22 @@ class Evidence:
 
 
 def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools,
-                  pin: MarkFix, paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
+                  anchor: MarkFix, paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
                   odometer_span: tuple[float, float] = (0.0, np.inf)) -> Evidence:
     """
     Return the plot data of a leg, at most KEPT_ROWS of each series.
 
     leg, inputs : raw and screened.   fixes_n : (k, 3) m, at inputs.t_fix.   kept : (k,) fixes
-    without gross errors; those within the time of the track are shown.   pin : mark whose position
-    the paths are set to.   paths : as configured and as calibrated.   t_fit : end of the fitted
-    data, s.   odometer_span : begin and end of the time with an odometer, s.
+    without gross errors; those within the time of the track are shown.   anchor : mark whose
+    position the paths are set to.   paths : as configured and as calibrated.   t_fit : end of the
+    fitted data, s.   odometer_span : begin and end of the time with an odometer, s.
     """
     inside = (track.t >= odometer_span[0]) & (track.t <= min(inputs.t_stop, odometer_span[1]))
     t = track.t[inside]
     span = (t[0], t[-1]) if len(t) else (0.0, -1.0)
     kept = kept & (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
     t_fix, fix_n, covariance = inputs.t_fix[kept], fixes_n[kept], inputs.covariance_n[kept]
-    before, after = (_pin_path(path, pin) for path in paths)
+    before, after = (_anchored_path(path, anchor) for path in paths)
     after_n, fixed_n = after(t), after(t_fix)
     yaw = np.unwrap(map_rows(yaw_from_quat, track.q_nb[inside]))
     sign = np.where(rate_over_second(t, track.s[inside]) < 0, -1.0, 1.0)
@@ -109,16 +109,16 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
     return tuple(gap for gap in gaps if gap[1] < span[1] and gap[2] > span[0])
 
 
-def _pin_path(path: Path, pin: MarkFix) -> Path:
+def _anchored_path(path: Path, anchor: MarkFix) -> Path:
     """Return a path shifted so that it has the position of a mark at the time of the mark."""
-    at_mark = path(np.array(pin.t))
+    at_mark = path(np.array(anchor.t))
 
-    def pinned(t: Floats) -> Floats:
+    def anchored(t: Floats) -> Floats:
         positions = np.empty((len(t), 3))
         for rows in chunks(len(t)):       # a path needs a 3 x 3 matrix for each row
-            positions[rows] = pin.position_n + path(t[rows]) - at_mark
+            positions[rows] = anchor.position_n + path(t[rows]) - at_mark
         return positions
-    return pinned
+    return anchored
 
 
 def _fix_states(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],

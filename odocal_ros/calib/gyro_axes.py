@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from odocal_ros.calib.drive import separated_fixes
-from odocal_ros.calib.track_check import ONE_MOTION_RATIO
+from odocal_ros.calib.track_check import PLAUSIBLE_RATIO
 from odocal_ros.data.arrays import Floats, map_rows
 from odocal_ros.nav.geodesy import MIN_GNSS_MOTION
 from odocal_ros.nav.rotations import arctan2
@@ -144,7 +144,7 @@ def wrong_axes_by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axe
         """Return the turn ratio of an axis, None if it is not that of the yaw rate."""
         ratio = turn_ratio(inputs.t_imu, map_rows(lambda w: w @ axis, w_i), inputs.t_fix,
                            located.fixes_n, located.fix_sigma, inputs.min_motion)
-        is_yaw = ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]
+        is_yaw = ratio is not None and PLAUSIBLE_RATIO[0] < abs(ratio) < PLAUSIBLE_RATIO[1]
         return ratio if is_yaw else None
     if yaw_ratio(axes[2]) is not None:
         return []
@@ -238,9 +238,9 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
 
 def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
     """Return GYRO_SIGN or IMU_UNITS if ``turn_ratio`` shows it; gyro_scale: as configured."""
-    if ratio is None or ONE_MOTION_RATIO[0] < ratio < ONE_MOTION_RATIO[1]:
+    if ratio is None or PLAUSIBLE_RATIO[0] < ratio < PLAUSIBLE_RATIO[1]:
         return ()
-    if ratio < -ONE_MOTION_RATIO[0]:
+    if ratio < -PLAUSIBLE_RATIO[0]:
         return (Reason(Code.GYRO_SIGN, 'turns by the gyro are opposite to those by the fixes '
                        f'(ratio {ratio:.2f}, expected: 1)'),)
     degrees = 40.0 < ratio < 80.0       # 180 / pi, with a margin for scale errors and skid
@@ -249,7 +249,7 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
                        'the fixes', 'Set imu.mounting_rpy if another IMU '
                        'axis is vertical; otherwise correct the IMU driver.'),)
     text = (f'turns by the gyro are {ratio:#.3g} times those by the fixes (limits '
-            f'{ONE_MOTION_RATIO[0]:g} and {ONE_MOTION_RATIO[1]:g})')
+            f'{PLAUSIBLE_RATIO[0]:g} and {PLAUSIBLE_RATIO[1]:g})')
     if degrees:
         return (Reason(Code.IMU_UNITS, text + ', typical for deg/s',
                        f'Set imu.gyro_scale to {gyro_scale * RAD_PER_DEG:.10g}, or publish rad/s '

@@ -31,22 +31,22 @@ from odocal_ros.nav.rotations import arctan2
 from odocal_ros.nav.time_series import integral_at, robust_sigma
 from odocal_ros.reasons import Code, Reason
 
-SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill: judgement
-SPIN_GRID = 0.2      # s between rows, a spin lasts longer: judgement
-SPAN = round(SPIN_WINDOW / SPIN_GRID)      # definition: rows of a window
+SLIP_WINDOW = 4.0    # s, longer than a slip, shorter than a hill: judgement
+EXCESS_GRID = 0.2    # s between rows, a slip lasts longer: judgement
+SPAN = round(SLIP_WINDOW / EXCESS_GRID)    # definition: rows of a window
 END_STEPS = 2        # rows each side over which the speed at an end is averaged: judgement
 # rad in a window: in larger turns the level error acts on another axis. Judgement
-SPIN_TURN = 0.1
-# counts, possible rounding error of a window: one over the 0.8 s of an end is 5 over the window,
-# plus 1 at the window's ends; the rest is margin: judgement
+MAX_WINDOW_TURN = 0.1
+# counts, possible rounding error of a window, 5 + 1 + 2: speed at an end wrong by 1 count in
+# 0.8 s, for 4 s; 1 at the ends of the window; margin: judgement
 WINDOW_ROUNDING_COUNTS = 8.0
 # m/s^2: a sliding wheel brakes the vehicle by at least this, even on ice (friction 0.1). Physical
 WEAKEST_BRAKING = 0.5
-STOPS = 0.5          # m/s, a speed below is a stop: judgement
-BRAKES_BESIDE = 1.0  # s around a slip searched for braking, a keyframe interval: judgement
+MAX_STOP_SPEED = 0.5  # m/s, a lower speed is a stop: judgement
+BRAKE_SEARCH = 1.0   # s, a keyframe interval, before and after a slip: judgement
 # s, delays of the odometer that are tested: judgement; a bus or a filter has less
 TESTED_DELAYS = 0.05 * np.arange(-10, 21)
-# s, judgement: between rows in the search for slips, which last a second or more
+# s, judgement: between rows in the search for slips of one wheel, which last a second or more
 SLIP_GRID = 0.1
 
 
@@ -55,8 +55,8 @@ class Slips(NamedTuple):
 
     t: Floats                                # (k,) s, middle of each slip
     size: Floats                             # (k,) m, > 0 if the wheel spun, < 0 if it slid
-    delay: float = 0.0                       # s, of the odometer; 0 if it does not look like slip
-    unforced_sign: Ints = np.empty(0, int)   # (k,) see the function ``unforced_sign``
+    delay: float = 0.0                       # s, of the odometer; 0 if it causes no apparent slip
+    travel_error_sign: Ints = np.empty(0, int)    # (k,) by the function ``travel_error_sign``
 
 
 def count_size(travel: Travel) -> float:
@@ -64,7 +64,7 @@ def count_size(travel: Travel) -> float:
     # their largest error over a window acts as WINDOW_ROUNDING_COUNTS of these counts
     coarse = travel.coarse
     return travel.quantum if coarse is None else (
-        coarse.max_error * SPIN_WINDOW / WINDOW_ROUNDING_COUNTS)
+        coarse.max_error * SLIP_WINDOW / WINDOW_ROUNDING_COUNTS)
 
 
 def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: float,
@@ -78,23 +78,23 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     """
     K = float(np.linalg.norm(f))
     grid = np.arange(max(track.t[0] - TESTED_DELAYS[0], t_imu[0]),
-                     min(track.t[-1] - TESTED_DELAYS[-1], t_imu[-1]), SPIN_GRID)
+                     min(track.t[-1] - TESTED_DELAYS[-1], t_imu[-1]), EXCESS_GRID)
     if len(grid) < 2 * SPAN:
         return Slips(np.empty(0), np.empty(0))
     a = acceleration(grid, t_imu, f_b, track, f / K, latitude)
     # in a turn the level error acts on another axis: such windows are excluded
     C = track.C_nb_at(grid)
     yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[END_STEPS:-END_STEPS]
-    turns = np.ptp(sliding_window_view(yaw, SPAN + 1), axis=1) > SPIN_TURN
+    turns = np.ptp(sliding_window_view(yaw, SPAN + 1), axis=1) > MAX_WINDOW_TURN
     windows = _Windows(grid, a, turns, track, K, quantum)
     # a mean of absolute values: slips hardly affect it
     delay = float(TESTED_DELAYS[np.argmin([np.abs(windows.excess(delay)).mean()
                                            for delay in TESTED_DELAYS])])
     t, size = windows.events(delay)
     looks_like_slip = len(windows.events(0.0)[0]) > len(t)
-    speed = K * np.diff(np.interp(grid + delay, track.t, track.s)) / SPIN_GRID
+    speed = K * np.diff(np.interp(grid + delay, track.t, track.s)) / EXCESS_GRID
     mean_speed = np.convolve(speed, np.full(5, 0.2), 'valid')      # over a second
-    sign = [unforced_sign(middle - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], mean_speed)
+    sign = [travel_error_sign(middle - SLIP_WINDOW / 2, SLIP_WINDOW, metres, grid[:-5], mean_speed)
             for middle, metres in zip(t, size, strict=True)]
     return Slips(t, size, delay if looks_like_slip else 0.0, np.array(sign, int))
 
@@ -118,18 +118,18 @@ class _Windows:
     def events(self, delay: float) -> tuple[Floats, Floats]:
         """Return time, s, and size, m, of each slip, at an odometer delay, s."""
         excess = self.excess(delay)
-        # the usual excess of the drive (rough road, soft suspension) is no event
+        # rough roads and soft suspensions cause a small excess everywhere: no slip
         usual = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
         min_size = 0.45    # m, 3 sigmas: tilt drift gives 0.1 m/s^2 in a window, 0.15 m
         limit = max(min_size, WINDOW_ROUNDING_COUNTS * self.quantum * self.K, 6 * usual)
-        return _events(self.grid[END_STEPS:-SPAN - END_STEPS] + SPIN_WINDOW / 2, excess, limit)
+        return _events(self.grid[END_STEPS:-SPAN - END_STEPS] + SLIP_WINDOW / 2, excess, limit)
 
 
 def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward: Floats,
                  latitude: float) -> Floats:
     """Return the mean acceleration along the forward axis from each grid time to the next."""
     along = map_rows(lambda f_b: f_b @ forward, f_b)
-    force = np.diff(integral_at(grid, t_imu, along)) / SPIN_GRID
+    force = np.diff(integral_at(grid, t_imu, along)) / EXCESS_GRID
     rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
     return np.asarray(force - gravity(latitude, 0.0) * rise)
 
@@ -143,52 +143,53 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
 
     span : steps of a window.   a : (n - 1,) m/s^2.   path : (n,) m, at the rows of the grid.
     """
-    speed = running_sum(a) * SPIN_GRID        # up to a constant
-    difference = path - running_sum((speed[:-1] + speed[1:]) / 2) * SPIN_GRID
+    speed = running_sum(a) * EXCESS_GRID        # up to a constant
+    difference = path - running_sum((speed[:-1] + speed[1:]) / 2) * EXCESS_GRID
     # odometer speed minus speed by acceleration, at the ends of windows
     speed_offset = (difference[2 * END_STEPS:] - difference[:-2 * END_STEPS]) / (
-        2 * END_STEPS * SPIN_GRID)
+        2 * END_STEPS * EXCESS_GRID)
     difference = difference[END_STEPS:-END_STEPS]
-    line_path = (speed_offset[:-span] + speed_offset[span:]) / 2 * span * SPIN_GRID
+    line_path = (speed_offset[:-span] + speed_offset[span:]) / 2 * span * EXCESS_GRID
     return difference[span:] - difference[:-span] - line_path
 
 
 def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:
-    """Return time and size of each slip, by (m,) middles, s, and excess, m, of windows."""
+    """Return time and size of each slip from middle, s, and excess, m, of (m,) windows."""
     # windows that contain a slip are one group; the window in its middle contains all of the slip
     rows = np.flatnonzero(np.abs(excess) > limit)
-    groups = np.split(rows, np.flatnonzero(np.diff(middle[rows]) > SPIN_WINDOW / 2) + 1)
+    groups = np.split(rows, np.flatnonzero(np.diff(middle[rows]) > SLIP_WINDOW / 2) + 1)
     centres = [(group[0] + group[-1]) // 2 for group in groups if len(group)]
     windows = np.array([centre for centre in centres if abs(excess[centre]) > limit], int)
     return middle[windows], excess[windows]
 
 
-def unforced_sign(t: float, duration: float, metres: float, t_speed: Floats, speed: Floats) -> int:
+def travel_error_sign(t: float, duration: float, metres: float, t_speed: Floats,
+                      speed: Floats) -> int:
     """
-    Return -1 or 1 for travel that no force explains, 0 for slip.
+    Return -1 for missing travel of the odometer, 1 for excess travel, 0 for real slip.
 
-    A sliding wheel brakes the vehicle: -1 if the wheel travels less, and the vehicle does not
-    brake. Brakes do not spin a wheel: 1 if it travels more, and the vehicle brakes to a stop.
+    A wheel that slides travels less, and brakes the vehicle: less travel without braking is
+    missing. Braking does not spin a wheel: more travel while braking to a stop is excess.
 
-    t, duration : s, of the slip.   metres : wheel travel minus vehicle travel.   t_speed, speed :
-    (n,) s, m/s, of the vehicle, < 0 backwards.
+    t, duration : begin and duration of the slip, s.   metres : wheel travel minus vehicle travel.
+    t_speed, speed : (n,) s, m/s, of the vehicle, < 0 backwards.
     """
     def near_slip(margin: float) -> tuple[Floats, Floats, float]:
-        """Return sizes of the speed, their rates, and the signed sum of speeds, near the slip."""
+        """Return |speed|, its rate of change, and the sum of the signed speed, near the slip."""
         first, last = np.searchsorted(t_speed, (t - margin, t + duration + margin + 1e-9))
         size = np.abs(speed[first:last])
         return size, np.diff(size) / np.diff(t_speed[first:last]), speed[first:last].sum()
 
-    _, rate, direction = near_slip(BRAKES_BESIDE)
+    _, rate, direction = near_slip(BRAKE_SEARCH)
     if metres * direction < 0:
         return -int(len(rate) and rate.min() > -WEAKEST_BRAKING)
     size, rate, _ = near_slip(0.0)
-    stops = len(rate) and ((rate < -WEAKEST_BRAKING) | (size[1:] < STOPS)).all()
-    return int(stops and size.min() < STOPS)
+    stops = len(rate) and ((rate < -WEAKEST_BRAKING) | (size[1:] < MAX_STOP_SPEED)).all()
+    return int(stops and size.min() < MAX_STOP_SPEED)
 
 
 def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
-    """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m; sign : ``unforced_sign``."""
+    """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m; sign : their error sign."""
     reasons = []
     for code, tested_sign, relation, circumstance in (
             (Code.TRAVEL_MISSING, -1, 'less', 'without braking'),
@@ -211,10 +212,10 @@ def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floa
 
 
 def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
-    """Return the reasons for delay, slip and unforced travel; time_offset : as configured, s."""
+    """Return the reasons for delay, slip and travel errors; time_offset : as configured, s."""
     reasons: tuple[Reason, ...] = ()
-    by_force = slips.unforced_sign == 0
-    t, size, delay = slips.t[by_force], slips.size[by_force], slips.delay
+    is_slip = slips.travel_error_sign == 0
+    t, size, delay = slips.t[is_slip], slips.size[is_slip], slips.delay
     if delay:
         reasons += (Reason(
             Code.DELAY_SEEN, f'odometer stamps are about {abs(delay):.2f} s '
@@ -225,7 +226,7 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
             Code.WHEEL_SLIP, f'odometer and IMU disagree by {np.abs(size).sum():.2f} m in total '
             f'at {len(t)} place{"s" * (len(t) > 1)}, first by {size[0]:+z.2f} m at t = {t[0]:.1f} '
             's. Likely cause: the wheel spun or slid'),)
-    return (*reasons, *travel_reasons(slips.t, slips.size, slips.unforced_sign))
+    return (*reasons, *travel_reasons(slips.t, slips.size, slips.travel_error_sign))
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +237,7 @@ class WheelSlips:
     end: Floats      # s
     size: Floats     # m, > 0: the wheel turned too far; unknown wheel: right minus left
     wheel: Ints      # -1 left, +1 right, 0 unknown
-    change: float = 0.0    # of the ratio right / left in the drive, as one step at half the path
+    change: float = 0.0    # change of the ratio right / left, as one step at half the path
     count: int = 2                   # number of wheels in the mean
 
     @property

@@ -4,10 +4,10 @@
 """
 Dead-reckoned track compared with all fixes: residuals, errors by path length, and reversing.
 
-Residuals are track minus fixes. Reversing with an odometer that counts upwards flips the direction
-of the track by half a turn from one piece of the drive to the next. The fixes remain behind the
-track by twice the piece's length; a fix error opposite to the travel disappears again. The track
-of this test is level: an attitude by gyros alone tilts within minutes.
+Residuals are track minus fixes. If an odometer counts up while the vehicle reverses, the direction
+of the track is wrong by half a turn. After the reversal, track and fixes stay apart by twice the
+reversed length; after a fix error they come together again. The track of this test is level: an
+attitude by gyros alone tilts within minutes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,30 +24,30 @@ from odocal_ros.nav.time_series import robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS, OUTLIER_SIGMAS, REMARK_SIGMAS
 
-# limits of path length, or turn, by the track relative to the fixes. Physical: errors of scale,
-# skid or lean are smaller; fixes that only jump have any path length
-ONE_MOTION_RATIO = 0.6, 1.6
+# limits of path length by track over path length by fixes; also of turns. Physical: errors of
+# scale, skid or lean are smaller; fixes that only jump have any path length
+PLAUSIBLE_RATIO = 0.6, 1.6
 # smallest factor applied to stated fix sigmas. Statistical: by the median of 30 fixes, chance
 # alone gives 1.25 instead of 1 once in 30 legs
 MIN_NOISE_FACTOR = 1.25
-PIECE_LENGTHS_M = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's benchmark, for roads
-PIECE_STARTS = 10     # definition: number of starts of pieces within the length of one, as there
-# rad: a larger change of direction is a flip. Judgement: half a turn, minus a margin for noise
-# and drift
-FLIP = np.deg2rad(135.0)
+SECTION_LENGTHS_M = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's benchmark, for roads
+SECTION_STARTS = 10     # definition: a section starts every tenth of the length, as in KITTI
+# rad: a larger change of direction is a reversal. Judgement: half a turn, minus a margin for
+# noise and drift
+MIN_REVERSAL_TURN = np.deg2rad(135.0)
 # s around a reversal, within which a fix error disappears. Judgement: duration of multipath
 FIX_ERROR_DURATION = 60.0
 
 
-def track_residuals(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
+def track_residuals(path: Path, anchor: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 
-    path : function of t (n,) to the antenna's path, (n, 3) m, up to a constant.   pin : mark
+    path : function of t (n,) to the antenna's path, (n, 3) m, up to a constant.   anchor : mark
     whose position the path is set to.   fixes : (t, position_n) within the leg.
     """
     t, position_n = fixes
-    return pin.position_n + path(t) - path(np.array(pin.t)) - position_n
+    return anchor.position_n + path(t) - path(np.array(anchor.t)) - position_n
 
 
 def track_statistics(residual: Floats, distance: float) -> TrackCheck:
@@ -63,11 +63,11 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     Return the factors on stated fix sigmas by the residuals, east, north, up: (3,).
 
     residual : (n, 3) corrected track minus fixes, m; NaN up where no height is known.
-    covariance_n : (n, 3, 3) stated, m^2.   drift : possible track error by gyro drift, m, whose
-    square is subtracted. The rest may include other track errors, so the factors tend to be too
-    large; below MIN_NOISE_FACTOR they are 1.   marks : the two that the track is pinned to.
-    Their errors act in proportion to the path, on average a third of each variance; the factor
-    applies to them as well.
+    covariance_n : (n, 3, 3) stated, m^2.   drift : track error by gyro drift, m; subtracted in
+    quadrature. Other track errors are not subtracted, so factors are too large rather than too
+    small; below MIN_NOISE_FACTOR they are 1.   marks : start and stop mark, at which track and
+    fix are equal. Their errors act in proportion to the path, on average a third of each
+    variance; the factor applies to them as well.
     """
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
     # east plus north, whose squared length is exponentially distributed
@@ -101,10 +101,10 @@ def distance_reasons(check: TrackCheck, fix_sigma: float, drift: float,
 def bend_reasons(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: float,
                  distance: float) -> tuple[Reason, ...]:
     """
-    Return MODEL_MISMATCH if a pinned track bends more than gyro drift and fix errors explain.
+    Return MODEL_MISMATCH if a track bends more than gyro drift and fix errors explain.
 
-    The ends alone do not show a false or missing turn between them. Means of the residuals over
-    windows do, across the chord; the means along it show the size of slow fix errors.
+    Track and fixes are equal at both marks, which do not show a wrong turn between them. Means of
+    residuals across the chord do; means along it show the size of slow fix errors.
 
     t, residual : (n,), (n, 3) times, s, and corrected track minus fixes, m.   chord_n : (3,) from
     mark to mark, m.   fix_sigma, drift : sigma of a fix, and possible track error by gyro drift,
@@ -144,7 +144,7 @@ def find_inliers(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
 
 def errors_per_distance(path: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
     """
-    Return the rms errors of two tracks over pieces of the path, each set to the fix at its begin.
+    Return the rms errors of two tracks over sections of the path, each set to its first fix.
 
     path : (k,) path length at each fix, m.   before, after : (k, 3) track minus fixes, m, up to a
     constant. The noise of the fixes is included.
@@ -155,24 +155,24 @@ def errors_per_distance(path: Floats, before: Floats, after: Floats) -> tuple[Pe
 
 def _squared_errors(path: Floats, before: Floats,
                     after: Floats) -> Iterator[tuple[float, float, list[Floats]]]:
-    """Yield the length of pieces, path over length, squared errors before and after, (p,) m^2."""
-    for length in PIECE_LENGTHS_M:
-        first, last = _piece_ends(path, length)
+    """Yield section length, path over length, and squared errors before and after, (p,) m^2."""
+    for length in SECTION_LENGTHS_M:
+        first, last = _section_ends(path, length)
         if len(first):
             squares = [((residual[last] - residual[first])[:, :2]**2).sum(axis=1)
                        for residual in (before, after)]
-            yield length, len(first) / PIECE_STARTS, squares
+            yield length, len(first) / SECTION_STARTS, squares
 
 
-def _piece_ends(path: Floats, length: float) -> tuple[Ints, Ints]:
-    """Return first and last rows of pieces of a length, which begin every tenth of the length."""
+def _section_ends(path: Floats, length: float) -> tuple[Ints, Ints]:
+    """Return first and last rows of sections, which begin every tenth of their length."""
     begin = np.arange(path[0], path[-1] - length,
-                      length / PIECE_STARTS) if len(path) else np.empty(0)
+                      length / SECTION_STARTS) if len(path) else np.empty(0)
     first = np.searchsorted(path, begin)
     last = np.searchsorted(path, path[first] + length)
     is_complete = last < len(path)
     first, last = first[is_complete], last[is_complete]
-    has_fixes = path[last] - path[first] <= 1.2 * length      # in longer pieces fixes are missing
+    has_fixes = path[last] - path[first] <= 1.2 * length      # in longer ones fixes are missing
     return first[has_fixes], last[has_fixes]
 
 
@@ -185,7 +185,7 @@ def worse_check_reasons(path: Floats, before: Floats, after: Floats,
     """
     for length, count, (was, now) in _squared_errors(path, before, after):
         increase = now - was
-        # fewer than three pieces end to end have no known scatter; a tenth more is acceptable
+        # fewer than three sections end to end have no known scatter; a tenth more is acceptable
         if count >= 3 and now.mean() >= 1.1**2 * was.mean() \
                 and increase.mean() >= REMARK_SIGMAS * increase.std() / np.sqrt(count):
             track = 'track as configured' if configured else 'uncalibrated track'
@@ -195,8 +195,8 @@ def worse_check_reasons(path: Floats, before: Floats, after: Floats,
     return []
 
 
-class Pieces(NamedTuple):
-    """Pieces of a drive between fixes, one after the other: (k,) each."""
+class CourseSections(NamedTuple):
+    """Consecutive sections of a drive, each from a fix to a later one: (k,)."""
 
     t: Floats              # s, the middle
     heading_error: Floats  # rad, direction of the track minus course by the fixes
@@ -205,9 +205,9 @@ class Pieces(NamedTuple):
     course: Floats         # rad, direction by the fixes
 
 
-def cut_pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Pieces:
+def cut_sections(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> CourseSections:
     """
-    Return the drive in pieces long enough for a direction.
+    Return the drive in sections long enough for a direction.
 
     track_2d, fixes_2d, t : (n, 2), (n, 2), (n,) at the fixes, any unit, m and s.   sigma : white
     noise of a fix, m.
@@ -215,46 +215,47 @@ def cut_pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> P
     # the sigma of a direction is then sqrt(2) / 20 rad
     knots = np.array(separated_fixes(fixes_2d, max(10.0, 20 * sigma)), int)
     if len(knots) < 2:
-        return Pieces(*(np.empty(0),) * 5)
+        return CourseSections(*(np.empty(0),) * 5)
     track, fix = np.diff(track_2d[knots], axis=0), np.diff(fixes_2d[knots], axis=0)
     length, course = np.hypot(*fix.T), arctan2(*fix.T[::-1])
     ratio = np.hypot(*track.T) / length
     middle = (t[knots[:-1]] + t[knots[1:]]) / 2
-    return Pieces(middle, wrap(arctan2(*track.T[::-1]) - course), length,
+    return CourseSections(middle, wrap(arctan2(*track.T[::-1]) - course), length,
                   ratio / (np.median(ratio) or 1.0), course)
 
 
-def find_reversed(pieces: Pieces) -> Bools:
+def find_reversed(sections: CourseSections) -> Bools:
     """
-    Return True for pieces that are driven backwards: (k,) bool.
+    Return True for sections that are driven backwards: (k,) bool.
 
-    The heading error is a random walk: its variance grows with the time between pieces, and its
-    size is by the median of its changes. A piece beyond FLIP from the mean of those before is
-    opposite to them. Where FAULT_SIGMAS of the walk exceed FLIP, the drive is divided; each part
-    has its own forward direction, that of most of its pieces.
+    The heading error is a random walk: its variance grows with the time between sections. The
+    median of its changes gives its size. A section is opposite if its error is more than
+    MIN_REVERSAL_TURN from the mean of earlier ones. Where FAULT_SIGMAS of the walk exceed it, the
+    drive is divided; forward is the direction of most sections of each division.
 
-    A piece whose path length by track and by fixes differs too much, as on the spot or with a
-    jump of the fixes, has no direction.
+    Sections whose path lengths by track and by fixes differ too much (turns on the spot, jumps of
+    the fixes) have no direction.
     """
-    is_reversed = np.zeros(len(pieces.t), bool)
-    if len(pieces.t) > 1:        # without the remaining gyro bias, a constant rate of the error
-        rate = np.median(wrap(np.diff(pieces.heading_error)) / np.diff(pieces.t))
-        pieces = pieces._replace(heading_error=wrap(pieces.heading_error - rate * pieces.t))
-    moves = np.flatnonzero((pieces.length_ratio > ONE_MOTION_RATIO[0])
-                           & (pieces.length_ratio < ONE_MOTION_RATIO[1]))
+    is_reversed = np.zeros(len(sections.t), bool)
+    heading_error = sections.heading_error
+    if len(sections.t) > 1:        # without the remaining gyro bias, a constant rate of the error
+        rate = np.median(wrap(np.diff(heading_error)) / np.diff(sections.t))
+        sections = sections._replace(heading_error=wrap(heading_error - rate * sections.t))
+    moves = np.flatnonzero((sections.length_ratio > PLAUSIBLE_RATIO[0])
+                           & (sections.length_ratio < PLAUSIBLE_RATIO[1]))
     if len(moves) < 3:
         return is_reversed
-    error = pieces.heading_error[moves]
-    dt = np.maximum(np.diff(pieces.t[moves]), 1e-9)
+    error = sections.heading_error[moves]
+    dt = np.maximum(np.diff(sections.t[moves]), 1e-9)
     sigma = robust_sigma(wrap(np.diff(error))) * np.sqrt(np.maximum(dt / np.median(dt), 1.0))
-    divisions = np.flatnonzero(FAULT_SIGMAS * sigma > FLIP) + 1
+    first_rows = np.flatnonzero(FAULT_SIGMAS * sigma > MIN_REVERSAL_TURN) + 1
     opposite = _is_opposite(error)
-    for part in np.split(np.arange(len(moves)), divisions):
-        flipped = opposite[part] != (np.mean(opposite[part]) > 0.5)
-        for begin, end in runs(flipped):
-            run = moves[part[begin:end]]
-            if _fixes_stay_behind(pieces, run, moves[part[~flipped]]):
-                is_reversed[run] = True
+    for division in np.split(np.arange(len(moves)), first_rows):
+        backward = opposite[division] != (np.mean(opposite[division]) > 0.5)
+        for begin, end in runs(backward):
+            tested = moves[division[begin:end]]
+            if _fixes_stay_behind(sections, tested, moves[division[~backward]]):
+                is_reversed[tested] = True
     return is_reversed
 
 
@@ -262,36 +263,36 @@ def _is_opposite(heading_error: Floats) -> Bools:
     """Return True for angles, rad, opposite to the running mean of those before: (k,)."""
     mean, opposite = float(heading_error[0]), np.zeros(len(heading_error), bool)
     for k, angle in enumerate(heading_error.tolist()):
-        opposite[k] = abs(wrap(angle - mean)) > FLIP
+        opposite[k] = abs(wrap(angle - mean)) > MIN_REVERSAL_TURN
         mean += float(wrap(angle - mean - np.pi * opposite[k])) / 2
     return opposite
 
 
-def _fixes_stay_behind(pieces: Pieces, run: Ints, forward: Ints) -> bool:
+def _fixes_stay_behind(sections: CourseSections, tested: Ints, forward: Ints) -> bool:
     """
-    Return True if the fixes stay behind the track after a run of pieces, as after a reversal.
+    Return True if the fixes stay behind the track after some sections, as after a reversal.
 
-    Over FIX_ERROR_DURATION to each side, the displacement of the fixes is then nearer to that of
-    the track with the run reversed; after a fix error, which disappears, to that of the track.
-    run, forward : indices of the pieces that may be reversed, and of forward ones.
+    From FIX_ERROR_DURATION before to after them, the displacement of the fixes is then nearer to
+    that of the track with these sections reversed; after a fix error, to that of the track.
+    tested, forward : indices of consecutive sections that may be reversed, and of forward ones.
     """
-    t, error = pieces.t, pieces.heading_error
-    nearby = np.flatnonzero((t >= t[run[0]] - FIX_ERROR_DURATION)
-                            & (t <= t[run[-1]] + FIX_ERROR_DURATION))
-    # the median heading error of forward pieces: that of a single one contains a fix error
+    t, error = sections.t, sections.heading_error
+    nearby = np.flatnonzero((t >= t[tested[0]] - FIX_ERROR_DURATION)
+                            & (t <= t[tested[-1]] + FIX_ERROR_DURATION))
+    # the median heading error of forward sections: that of a single one contains a fix error
     forward_errors = error[forward[np.isin(forward, nearby)]]
-    nearest = float(error[forward[np.argmin(np.abs(t[forward] - t[run[0]]))]])
+    nearest = float(error[forward[np.argmin(np.abs(t[forward] - t[tested[0]]))]])
     usual = nearest + (float(np.median(wrap(forward_errors - nearest)))
                        if len(forward_errors) else 0.0)
-    track = pieces.length_ratio[nearby] * pieces.length[nearby] * np.exp(
-        1j * (pieces.course[nearby] + error[nearby] - usual))
-    behind = np.sum(pieces.length[nearby] * np.exp(1j * pieces.course[nearby])) - track.sum()
-    return bool(abs(behind + 2 * track[np.isin(nearby, run)].sum()) < abs(behind))
+    track = sections.length_ratio[nearby] * sections.length[nearby] * np.exp(
+        1j * (sections.course[nearby] + error[nearby] - usual))
+    behind = np.sum(sections.length[nearby] * np.exp(1j * sections.course[nearby])) - track.sum()
+    return bool(abs(behind + 2 * track[np.isin(nearby, tested)].sum()) < abs(behind))
 
 
-def reversal_reasons(pieces: Pieces, signed: bool) -> tuple[Reason, ...]:
+def reversal_reasons(sections: CourseSections, signed: bool) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH if counts increase while the vehicle drives backwards."""
-    is_reversed = find_reversed(pieces)
+    is_reversed = find_reversed(sections)
     cause = 'the counter does not count down' if signed else 'odometer.signed is false'
     return (Reason(Code.TRACK_MISMATCH, f'in {int(is_reversed.sum())} of {len(is_reversed)} '
                    'sections the track runs opposite to the fixes. Likely cause: the vehicle '

@@ -234,15 +234,15 @@ def _find_wheel(pair: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats
     # IMU, one of the left by -x moves it by -x / 2; the noise is the difference of mean and IMU
     # elsewhere
     begin, end, size = event
-    grid = np.arange(max(track.t[0], pair.t[0]), min(track.t[-1], pair.t[-1]), slip.SPIN_GRID)
+    grid = np.arange(max(track.t[0], pair.t[0]), min(track.t[-1], pair.t[-1]), slip.EXCESS_GRID)
     margin = 1.0        # s each side of a slip, in which speeds are set equal
-    span = max(round((end - begin + 2 * margin) / slip.SPIN_GRID), 4 * slip.END_STEPS)
+    span = max(round((end - begin + 2 * margin) / slip.EXCESS_GRID), 4 * slip.END_STEPS)
     if len(grid) < 3 * span:
         return 0
     a = slip.acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)
     excess = slip.excess_path(span, a, np.interp(grid, pair.t, mean))
     turn = np.interp(grid, pair.t, pair.turn)[slip.END_STEPS:-slip.END_STEPS]
-    straight = np.abs(turn[span:] - turn[:-span]) < slip.SPIN_TURN
+    straight = np.abs(turn[span:] - turn[:-span]) < slip.MAX_WINDOW_TURN
     window = int(np.searchsorted(grid, (begin + end) / 2)) - slip.END_STEPS - span // 2
     if not 0 <= window < len(excess) or not straight[window] or straight.sum() < 20:
         return 0

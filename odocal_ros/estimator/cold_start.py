@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.track_check import cut_pieces, find_inliers
+from odocal_ros.calib.track_check import cut_sections, find_inliers
 from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.estimator.factors.odometer import odometer_speed
 from odocal_ros.estimator.imu import gyro_bias_at_rest, ImuSteps
@@ -73,15 +73,15 @@ class FittedTrack:
         for _ in range(2):
             residual = self.K * np.exp(1j * self.chi) * X - z
             inliers, noise = find_inliers(np.stack([residual.real, residual.imag], -1), sigma)
-            pieces = cut_pieces((xy * self.K)[inliers], fix_xy[inliers], t_fix[inliers], noise)
-            rotation = -pieces.heading_error
+            sections = cut_sections((xy * self.K)[inliers], fix_xy[inliers], t_fix[inliers], noise)
+            rotation = -sections.heading_error
             if not len(rotation):
                 break
             mean = float(np.angle(np.exp(1j * rotation).sum()))
             if len(rotation) > 1:
                 rotation = np.unwrap(mean + wrap(rotation - mean))
-            self.chi, self.slope = fit_robust_line(pieces.t, rotation)
-            rows = np.interp(pieces.t, t_fix, np.arange(len(t_fix)))
+            self.chi, self.slope = fit_robust_line(sections.t, rotation)
+            rows = np.interp(sections.t, t_fix, np.arange(len(t_fix)))
             k = np.unique(np.round(rows).astype(int))
             path, chord = np.abs(np.diff(X[k])), np.abs(np.diff(z[k]))
             if (path > 0).any():

@@ -22,7 +22,7 @@ from odocal_ros.calib.evidence import KEPT_ROWS, make_evidence
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, Path, standing_at
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.scale_variation import counter_change_reasons
-from odocal_ros.calib.slip import count_size, find_slips, Slips, SPIN_WINDOW, WheelSlips
+from odocal_ros.calib.slip import count_size, find_slips, SLIP_WINDOW, Slips, WheelSlips
 from odocal_ros.data.arrays import Bools, Floats, map_rows, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav import dead_reckoning
@@ -188,12 +188,13 @@ def configured_forward(prepared: PreparedLeg, f: Floats,
     return scale * dead_reckoning.forward_b(*angles)
 
 
-def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
+def without_outliers(prepared: PreparedLeg, path: Path, anchor: MarkFix,
                      between: Bools) -> tuple[Bools, tuple[Reason, ...]]:
     """Return a mask of fixes, (k,), without gross outliers from a fitted path, and reasons."""
     if not between.any():
         return between, ()
-    residuals = track_check.track_residuals(path, pin, (prepared.inputs.t_fix, prepared.fixes_n))
+    fixes = prepared.inputs.t_fix, prepared.fixes_n
+    residuals = track_check.track_residuals(path, anchor, fixes)
     distances = np.hypot(*residuals[:, :2].T)
     # 20 times the usual distance from the track: a certain outlier
     limit_m = 20.0 * max(float(np.median(distances[between])), prepared.fix_sigma)
@@ -219,13 +220,13 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     if not prepared.origin.is_local:       # else the position on the Earth is unknown
         fields |= {'origin': (prepared.origin.latitude, prepared.origin.longitude,
                               prepared.origin.height)}
-    pin, between, path_length, section_reasons = _compared_section(prepared, after, start)
+    anchor, between, path_length, section_reasons = _compared_section(prepared, after, start)
     fields['reference_n'] = prepared.fixes_n[between]
-    if pin is None or between.sum() < MIN_TRACK_FIXES:
+    if anchor is None or between.sum() < MIN_TRACK_FIXES:
         return fields, section_reasons
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
     residual_before, residual_after = (
-        track_check.track_residuals(path, pin, fixes) for path in paths)
+        track_check.track_residuals(path, anchor, fixes) for path in paths)
     fields |= {'before': track_check.track_statistics(residual_before, path_length),
                'after': track_check.track_statistics(residual_after, path_length)}
     errors = np.interp(fixes[0], *path_length_over_time(prepared)), residual_before, residual_after
@@ -244,11 +245,11 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
     start = prepared.mark(prepared.time_span[0], path, 'start')
     if start is None:
         return {}, ()
-    pin, between, path_length, reasons = _compared_section(prepared, path, start)
-    if pin is None or between.sum() < MIN_TRACK_FIXES:
+    anchor, between, path_length, reasons = _compared_section(prepared, path, start)
+    if anchor is None or between.sum() < MIN_TRACK_FIXES:
         return {}, reasons
     fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    residuals = track_check.track_residuals(path, pin, fixes)
+    residuals = track_check.track_residuals(path, anchor, fixes)
     return {'check': asdict(track_check.track_statistics(residuals, path_length))}, reasons
 
 
@@ -257,22 +258,22 @@ def _compared_section(prepared: PreparedLeg, path: Path,
     """
     Return the section in which a path is compared with the fixes.
 
-    That is: the mark at which both are equal (pin), a mask of the fixes, the path length, m, and
-    reasons.
+    That is: the anchor, the mark at which both are equal; a mask of the fixes; the path length,
+    m; and reasons.
     """
-    pin: MarkFix | None = start
+    anchor: MarkFix | None = start
     begin, end = start.t, prepared.t_fit
     reasons: tuple[Reason, ...] = ()
     if prepared.holdout:
-        pin = prepared.mark(prepared.t_fit, path)
+        anchor = prepared.mark(prepared.t_fit, path)
         begin, end = prepared.t_fit, prepared.inputs.t_stop
     end = min(end, prepared.time_span[1])
     between = (prepared.inputs.t_fix >= begin) & (prepared.inputs.t_fix <= end)
-    if pin is not None:
-        inside, reasons = without_outliers(prepared, path, pin, between)
+    if anchor is not None:
+        inside, reasons = without_outliers(prepared, path, anchor, between)
         between &= inside
     a, b = np.interp([begin, end], *path_length_over_time(prepared))
-    return pin, between, b - a, reasons
+    return anchor, between, b - a, reasons
 
 
 def path_length_over_time(prepared: PreparedLeg) -> tuple[Floats, Floats]:
@@ -288,7 +289,7 @@ def slip_check(prepared: PreparedLeg, track: dead_reckoning.Track, f: Floats,
         return Slips(np.empty(0), np.empty(0))
     slips = find_slips(prepared.inputs.t_imu, prepared.inputs.f_b, track, f,
                        prepared.origin.latitude, count_size(prepared.inputs.travel))
-    of_one_wheel = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SPIN_WINDOW).any(axis=1)
+    of_one_wheel = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SLIP_WINDOW).any(axis=1)
     kept = (slips.t >= between[0]) & (slips.t <= between[1]) & ~of_one_wheel
     return slips._replace(t=slips.t[kept], size=slips.size[kept],
-                          unforced_sign=slips.unforced_sign[kept])
+                          travel_error_sign=slips.travel_error_sign[kept])

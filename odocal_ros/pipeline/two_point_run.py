@@ -181,8 +181,9 @@ class TwoPointRun:
         # track errors count as noise
         keep, _ = track_check.find_inliers(residual, prepared.fix_sigma)
         sigma = max(prepared.fix_sigma, fix_white_noise(p[keep]))
-        pieces = track_check.cut_pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma)
-        reversals = track_check.reversal_reasons(pieces, self.config.odometer.signed)
+        sections = track_check.cut_sections(
+            prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma)
+        reversals = track_check.reversal_reasons(sections, self.config.odometer.signed)
         self.data_reasons += reversals
         if not reversals:
             residuals = track_check.track_residuals(prepared.path(f), two_point.start, fixes)

@@ -53,8 +53,8 @@ def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None, set_ns=0, **streams):
     fixes_n = path_n(inputs.t_fix) + [*off, 0.0]
     kept = np.ones(len(inputs.t_fix), bool)
     kept[[row for row, what in bad if what == 'far']] = False
-    pin = MarkFix(0.0, np.zeros(3), np.eye(3), True, 1)
-    return make_evidence(leg, inputs, track, fixes_n, kept, pin,
+    anchor = MarkFix(0.0, np.zeros(3), np.eye(3), True, 1)
+    return make_evidence(leg, inputs, track, fixes_n, kept, anchor,
                          (lambda t: 1.1 * path_n(t) + 7.0, lambda t: path_n(t) - 3.0), config)
 
 

@@ -12,7 +12,7 @@ import pytest
 from reversing_drives import made as by_hand
 from smoother_legs import leg_of, made, reason_texts, smoothed
 
-from odocal_ros.calib.slip import find_slips, unforced_sign
+from odocal_ros.calib.slip import find_slips, travel_error_sign
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.result import mismatch
@@ -152,7 +152,7 @@ def test_counts_lost_at_high_speed_are_an_error_of_the_scale(loss):
 def test_wheel_slips_only_in_the_direction_of_a_force(begin, metres, acceleration, sign, forward):
     t = np.arange(0.0, 20.0, 1.0)
     speed = begin + acceleration * np.clip(t - 9.0, 0.0, 2.0)
-    assert unforced_sign(9.0, 2.0, forward * metres, t, forward * speed) == sign
+    assert travel_error_sign(9.0, 2.0, forward * metres, t, forward * speed) == sign
 
 
 def test_held_speed_before_stops_is_not_slip():

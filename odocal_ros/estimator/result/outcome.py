@@ -18,7 +18,7 @@ from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root
 from odocal_ros.calib.evidence import KEPT_ROWS
 from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.calib.result import Estimate, MethodResult, Source
-from odocal_ros.calib.slip import travel_reasons, unforced_sign
+from odocal_ros.calib.slip import travel_error_sign, travel_reasons
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
@@ -189,8 +189,8 @@ def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals, slip_path
     slips = residuals.find_slips(fit, slip_path, count_m)
     speed = np.einsum('ni,nij,j->n', fit.state.v_n, fit.state.C_nb, fit.state.forward)
     # 0: slip; else no force explains it: the odometer lost (-1) or added (1) the travel
-    sign = np.array([unforced_sign(s.t, s.duration, s.metres, fit.state.t, speed) for s in slips],
-                    int)
+    sign = np.array([travel_error_sign(s.t, s.duration, s.metres, fit.state.t, speed)
+                     for s in slips], int)
     # a filter of unknown shape, or a late or held speed, also has errors at changes of speed
     level = '' if filtered or (sign > 0).any() else residuals.describe_slip_level(
         fit, marginals, count_m)
