@@ -75,7 +75,7 @@ class SpikeScreen:
 
     def __init__(self) -> None:
         self._mean_steps = 0.0, 0.0         # mean ``Step`` from row to row
-        self._equal_since = 0.0             # s, begin of equal rows
+        self._equal_since = 0.0             # s, start of a run of equal rows
         self._kept: deque[Row] = deque(maxlen=glitches.NEIGHBOUR_ROWS + 1)
         self._dropped = False               # a row was dropped since the last kept one
         self._step_size = ZERO              # rad/s, implausible step of the gyro, ZERO: none

@@ -14,7 +14,7 @@ from odocal_ros.settings.node_configs import ApplyConfig
 
 STILL_COUNTS = 1.5    # physical: largest number of counts of a wheel at rest
 SIDES = ('odometer', 'odometer_right')
-Rows = tuple[str, Sequence[Reading], OdometerForm]
+Block = tuple[str, Sequence[Reading], OdometerForm]      # slot (name of the input), rows, form
 MAX_WAITING_BLOCKS = 100       # judgement: blocks of rows kept before the first IMU message
 
 
@@ -26,12 +26,16 @@ class Wheels:
         self._reversed = config.odometer.reversed
         self._offset_ns = round(config.odometer.time_offset * 1e9)
         self._has_two_topics = config.odometer.has_two_topics
-        self._waiting: list[Rows] = []       # blocks from before the first IMU message
+        self._waiting: list[Block] = []       # blocks from before the first IMU message
         self._wheels: dict[str, Wheel] = {}
         self.quantum = 0.0                   # m, size of a count of the travel
 
     def feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm, zero_ns: int) -> None:
-        """Add rows of a wheel; zero_ns : stamp of t = 0, 0 before the first IMU message."""
+        """
+        Add rows of a wheel, or keep them until the first IMU message.
+
+        slot : name of the input, one of SIDES.   zero_ns : stamp of t = 0; 0: not known yet.
+        """
         self._waiting.append((slot, rows, form))
         if not zero_ns:
             self._waiting = self._waiting[-MAX_WAITING_BLOCKS:]
@@ -53,7 +57,7 @@ class Wheels:
         self._notes += wheel.notes
         wheel.notes.clear()
         wheels = self._wheels.values()
-        self.quantum = math.hypot(*(one.quantum for one in wheels)) / len(wheels)
+        self.quantum = math.hypot(*(wheel.quantum for wheel in wheels)) / len(wheels)
 
     def _set_scales(self, form: OdometerForm) -> None:
         """Set the scales of left and right wheel, if there are two and they are calibrated."""
@@ -85,10 +89,10 @@ class Wheels:
         return sum(wheel.variance_between(t_from, t_to) for wheel in wheels) / len(wheels)**2
 
     def variances(self, t: float, T: float) -> tuple[float, float]:
-        """Return the variances of the travel at t, and of the travel in the T s before, m^2."""
+        """Return the variances, m^2, of the travel until t, and from t - T to t."""
         wheels, squared_count = self._wheels.values(), len(self._wheels)**2
-        # a travel is the difference of two readings, each with a rounding of quantum^2 / 12; the
-        # jitter of a travel is that of its two ends
+        # travel is a difference of two readings: it has the rounding, quantum^2 / 12, and the
+        # jitter of both ends
         rounding = self.quantum**2 / 6
         jitter = sum(wheel.jitter_variance(t, T) for wheel in wheels) / squared_count
         interpolation = sum(wheel.interpolation_variance(t) for wheel in wheels) / squared_count
@@ -100,7 +104,7 @@ class Wheels:
         return max(wheel.delay_sigma_s for wheel in self._wheels.values())
 
     def are_still(self, t_from: float, t_to: float) -> bool:
-        """Return True if no wheel turned between two times and no counter hangs."""
+        """Return True if no wheel turned between two times and no counter is stuck."""
         return all(not wheel.is_hung and abs(wheel.travel_at(t_to) - wheel.travel_at(t_from))
                    <= REST_TRAVEL / 2 + STILL_COUNTS * wheel.quantum
                    for wheel in self._wheels.values())

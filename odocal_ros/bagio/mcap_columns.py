@@ -5,7 +5,7 @@
 Messages of an mcap file as columns: a block of chunks at a time, without a loop over messages.
 
 The message index after each chunk (mcap.dev/spec#message-index-op0x07) has the offsets of the
-records. They are verified: each record must be a message (op 0x05) that ends at the begin of the
+records. They are verified: each record must be a message (op 0x05) that ends at the start of the
 next one, or at the end of the chunk. Chunks that differ are read by a sequential scan.
 """
 

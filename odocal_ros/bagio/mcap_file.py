@@ -5,7 +5,7 @@
 Read an mcap file: topics, counts and messages.
 
 With a valid index only the chunks with the wanted topics are read. Without one, or in a damaged
-file, records are read from the begin of the file on, as far as they are valid.
+file, records are read from the start of the file, as far as they are valid.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -97,7 +97,7 @@ class McapFile(BagFile):
         self._recount()
 
     def _fast_batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
-        """Return the messages in batches; None if the index is missing or of other chunks."""
+        """Return the messages in batches; None without an index that matches the chunks."""
         channels = self._channels_of(topics)
         chunks = self._chunks_with(channels)
         times_begin, times_end = mcap.RECORD.size, mcap.RECORD.size + mcap.TIMES.size
@@ -120,7 +120,7 @@ class McapFile(BagFile):
         self._recount()
 
     def _read_chunks(self, chunks: Sequence[mcap.ChunkIndex]) -> list[mcap.Chunk | Damaged]:
-        """Return adjacent chunks of the index, each with its message index."""
+        """Return adjacent chunks from the file, each with its message index."""
         begin, end = chunks[0].offset, chunks[-1].offset + chunks[-1].size + chunks[-1].index_size
         data = self._file[begin:end]
         unpacked: list[mcap.Chunk | Damaged] = []
@@ -173,6 +173,7 @@ class McapFile(BagFile):
         return [entry for entry in messages if entry[1] in channels]
 
     def _scan(self) -> Iterator[tuple[int, int]]:
+        """Return (channel number, time in ns) of every readable message."""
         self._allowance.restart()
         entries = (entry for chunk in self._chunks
                    for entry in self._messages_of(chunk, self._channels)
@@ -239,15 +240,15 @@ class McapFile(BagFile):
         (number,) = struct.unpack_from('<H', body)
         if op == mcap.SCHEMA:
             name, offset = mcap.text_at(body, 2)
-            form, offset = mcap.text_at(body, offset)
+            encoding, offset = mcap.text_at(body, offset)
             text, _ = mcap.text_at(body, offset)
-            self._schemas[number] = name, (FORMATS.get(form, ''), text)
+            self._schemas[number] = name, (FORMATS.get(encoding, ''), text)
         elif number not in self._channels:
             topic, offset = mcap.text_at(body, 4)
-            form, _ = mcap.text_at(body, offset)
+            encoding, _ = mcap.text_at(body, offset)
             (schema,) = struct.unpack_from('<H', body, 2)
             name, definition = self._schemas.get(schema, ('', ('', '')))
-            self._channels[number] = Channel(topic, name, 0, form, definition)
+            self._channels[number] = Channel(topic, name, 0, encoding, definition)
 
     def close(self) -> None:
         self._file.close()

@@ -25,7 +25,7 @@ from odocal_ros.screening.inputs import Inputs
 # second reversed. Judgement: unintended angles are below 20 deg, and quarter turns are configured
 FAR_YAW, BACKWARDS_YAW = np.deg2rad(20.0), np.deg2rad(160.0)
 # rad, largest angle between a measured axis and the quarter turn assigned to it: a third of a
-# quarter turn; the axis must be determined with half of it as its sigma. Judgement
+# quarter turn; the sigma of the axis must be below half of this limit. Judgement
 AXIS_LIMIT = np.deg2rad(30.0)
 
 
@@ -33,8 +33,9 @@ AXIS_LIMIT = np.deg2rad(30.0)
 class Mounting:
     """The nominal rotation estimated from a drive."""
 
-    C_bi: Floats | None       # (3, 3) i to b, quarter turns only; None: not observable
-    up_i: Floats              # (3,) unit vector, measured
+    # (3, 3) rotation matrix from IMU frame i to body frame b, quarter turns; None: not observable
+    C_bi: Floats | None
+    up_i: Floats              # (3,) unit vector in i, measured
     forward_i: Floats | None  # (3,) the same; None: not observable
     forward_sigma: float      # rad
     assumed: bool             # True: forward is assumed to be x, not measured
@@ -46,7 +47,7 @@ class Mounting:
         return None if self.C_bi is None else _rpy(self.C_bi)
 
     @property
-    def unclear(self) -> str:
+    def why_unknown(self) -> str:
         """Return the reason why the rotation is not known, '' if it is."""
         sigma, deviation, limit = np.rad2deg([self.forward_sigma, self.deviation, AXIS_LIMIT])
         if self.C_bi is not None:
@@ -63,7 +64,7 @@ def remedy(estimate: Mounting) -> str:
     if estimate.C_bi is not None:
         return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy={_rpy_text(estimate.C_bi)}'"
                 + ", if the IMU's x axis points forward" * estimate.assumed + '.')
-    cause = estimate.unclear[0].upper() + estimate.unclear[1:]
+    cause = estimate.why_unknown[0].upper() + estimate.why_unknown[1:]
     if estimate.forward_i is not None:
         left_i = np.cross(estimate.up_i, estimate.forward_i)
         C = np.stack([estimate.forward_i, left_i, estimate.up_i])
@@ -126,8 +127,8 @@ def estimate_mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
 def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
              metres_per_unit: float) -> tuple[Floats | None, float]:
     """Return the forward axis (level, unit) and its sigma, rad; None if not observable."""
-    # in the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, one angle for both
-    # accelerations. If it does not fit, turns are inverted, as by a mirrored axis (tested later)
+    # level plane as complex numbers: f = e^(i theta) (dv/dt + i v w_up) + bias. If this does not
+    # fit, the sign of the turn is inverted (mirrored axis, tested later)
     binned = bin_accelerations(t, w_i, f_i, up_i, travel, metres_per_unit)
     if binned is None:
         return None, np.pi
@@ -143,13 +144,15 @@ def _angle(A: Complexes, F: Complexes) -> tuple[float, float]:
     """Return the angle from accelerations A to forces F and its sigma, rad; pi if unknown."""
     A, F = A - A.mean(), F - F.mean()
     power = float(np.vdot(A, A).real)
-    if len(A) < ORIENTATION_BINS or power < 1e-3 * len(A) * 0.05:     # hardly any acceleration
+    min_mean_square = 5e-5      # (m/s^2)^2: hardly any acceleration
+    if len(A) < ORIENTATION_BINS or power < min_mean_square * len(A):
         return 0.0, np.pi
     gain = np.vdot(A, F) / power
     if not gain:            # no accelerometer
         return 0.0, np.pi
     residual = F - gain * A
-    # half the residual is across the axis; adjacent bins share noise, so count every third
+    # half of the residual's variance is across the axis. Adjacent bins share noise: a third of
+    # them is independent
     variance = np.vdot(residual, residual).real / (2 * len(A) / 3)
     sigma = float(np.sqrt(variance / power) / abs(gain))
     return float(np.angle(gain)), sigma

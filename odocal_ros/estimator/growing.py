@@ -157,7 +157,7 @@ class GrowingFit:
 def _join_windows(finished: RunningEstimate, current: RunningEstimate,
                   config: Config) -> RunningEstimate:
     """Return the running estimate of finished windows and the one in progress."""
-    # the rate of the scale differs between windows, as tyres warm up from the begin of a leg
+    # the rate of the scale differs between windows, as tyres warm up from the start of a leg
     legs = [replace(one.method, marginal=_information(one.method).with_leg_errors(
                 {CONSTANTS[SCALE_BY_TIME]: np.inf}))
             for one in (finished, current)]

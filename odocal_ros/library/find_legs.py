@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The legs of a recording, as spans of stamps: requested, marked by the node, or searched.
+Find the legs of a recording, as spans of stamps.
 
-A searched leg begins and ends at standstills, as the node's automatic legs do.
+These are the legs requested by the user, else those marked by the node, else those between
+standstills.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,7 @@ from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.arguments import EACH_STOP, LegSpan
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.clocks import OFFSET_REACH
+from odocal_ros.screening.clocks import MAX_CLOCK_OFFSET
 from odocal_ros.screening.inputs import Inputs, locate_fixes
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 AnyBag: TypeAlias = 'Bag | Recording'     # an open bag, or one that was read
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
-# judgement: of the distance; a first stop after this share does not start a leg
+# judgement: a first standstill later than 20 % of the path is not the start of the leg
 LATEST_START_SHARE = 0.2
 COVERAGE_TOLERANCE_NS = 10 * 10**9    # judgement: drivers and recorders start and stop within it
 BAG_TIME_TOLERANCE_NS = 10 * 10**9    # judgement: stamps of a bag may be outside its bag times
@@ -49,7 +50,7 @@ class Standstills(NamedTuple):
 
 
 def marked_legs(bag: Bag) -> list[tuple[int, int]]:
-    """Return the legs marked by a node, not cancelled; stop 0 where the bag ends before it."""
+    """Return legs marked by a node, not cancelled; stop = 0: recording ended before the mark."""
     legs = []
     for values in last_statuses(bag):
         start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
@@ -99,8 +100,9 @@ def last_statuses(bag: Bag) -> list[dict[str, str]]:
         # ids begin again with each run of the node: a leg is identified by its start too
         leg_id = values.get('leg_id', ''), start
         last_event = last.get(leg_id, {}).get('leg_event', '')
-        # a leg without a number has not started; a dropped one stays dropped
-        if leg_id[0] not in ('', '0') and last_event not in DROPPED_EVENTS:
+        has_started = leg_id[0] not in ('', '0')
+        is_dropped = last_event in DROPPED_EVENTS      # and stays dropped
+        if has_started and not is_dropped:
             last[leg_id] = values | {'leg_event': values.get('leg_event') or last_event}
     return list(last.values())
 
@@ -134,7 +136,7 @@ def find_legs(recorder: LegRecorder, bag: AnyBag, requested: Sequence[LegSpan | 
     first, last = max(firsts), min(lasts)     # last before first: no common time
     has_both_ends = marks or any(
         isinstance(leg, LegSpan) and None not in (leg.start_ns, leg.stop_ns) for leg in requested)
-    if first - last > OFFSET_REACH * 1e9 and not has_both_ends:
+    if first - last > MAX_CLOCK_OFFSET * 1e9 and not has_both_ends:
         raise BadData(f'{bag.name}: {_no_common_time_text(recorder)}')
     last = max(last, first + 1)
 

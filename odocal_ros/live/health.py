@@ -29,7 +29,7 @@ class Health:
         self.count = 0
         self.unreadable_count = 0    # messages that could not be read
         self.lost_count = 0          # messages missing in the middleware's sequence numbers
-        self.lost_before_leg = 0     # ``lost_count`` at the begin of the leg
+        self.lost_before_leg = 0     # ``lost_count`` at the start of the leg
         self.gaps = 0          # steps of the stamps beyond the limit
         self.has_no_stamps = False    # no stamp in the last messages
         self.last_arrival_ns = 0

@@ -224,7 +224,7 @@ def find_step(value: Floats) -> float | None:
     peak = high[0] + int(np.argmax(coherence[high[0]:last + 1]))
     step = _refine_step(value, 1 / float(frequency[peak]))
     min_multiples = 6
-    # values accumulate at the begin of a cruise: two or three such speeds always have some step
+    # values accumulate at the start of a cruise: two or three such speeds always have some step
     return step if len(np.unique(np.rint(value / step))) >= min_multiples else None
 
 

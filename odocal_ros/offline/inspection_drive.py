@@ -174,7 +174,7 @@ def _mounting_facts(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Flo
     return {
         'accelerometer': inputs.has_accelerometer, 'rpy': axes.rpy,
         'assumed_forward': axes.assumed, 'deviation': axes.deviation,
-        'unclear': axes.unclear + '; imu.mounting_rpy is used as set' * is_configured,
+        'unclear': axes.why_unknown + '; imu.mounting_rpy is used as set' * is_configured,
         'forward_i': None if axes.forward_i is None else axes.forward_i.tolist(),
         'forward_sigma': axes.forward_sigma if axes.forward_i is not None else None,
         'needed': axes.rpy is not None and not agrees and not is_configured}, travel

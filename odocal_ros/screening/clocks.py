@@ -7,7 +7,7 @@ Clocks: offsets between the stamps of topics, and clocks that were set during th
 Sensors of two computers may have clocks that are seconds apart although stamps and arrivals agree.
 Such an offset is estimated from the motion that IMU, odometer and fixes all measure: the
 acceleration of the odometer is compared with the specific force at all offsets, the speed of the
-fixes with that of the odometer. Offsets up to OFFSET_REACH are delays, which the smoother
+fixes with that of the odometer. Offsets up to MAX_CLOCK_OFFSET are delays, which the smoother
 estimates.
 """
 
@@ -35,7 +35,7 @@ from odocal_ros.screening.inputs import Inputs, LocatedFixes
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_DIFFERENCE_LIMIT
 
-OFFSET_REACH = 1.0     # s, format: range of a time_offset setting
+MAX_CLOCK_OFFSET = 1.0     # s, larger ones are no delay. Format: range of a time_offset setting
 # judgement: least step of a clock that is detected, s; rows before and after it whose median lag
 # gives its size
 CLOCK_STEP, STEP_LAG_ROWS = 0.01, 50
@@ -80,13 +80,14 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
                 Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {lead_s:+z.3f} s '
                 'from IMU stamps that arrive at the same time; the limit is '
                 f'{CLOCK_DIFFERENCE_LIMIT:g} s'
-                f'{hint if group and abs(lead_s) <= OFFSET_REACH else ""}', clock_remedy(lead_s)))
+                f'{hint if group and abs(lead_s) <= MAX_CLOCK_OFFSET else ""}',
+                clock_remedy(lead_s)))
     return reasons
 
 
 def clock_remedy(lead_s: float) -> str:
     """Return the remedy for a clock that is ``lead_s`` s ahead of the IMU clock."""
-    return SYNCHRONISE_REMEDY if abs(lead_s) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
+    return SYNCHRONISE_REMEDY if abs(lead_s) > MAX_CLOCK_OFFSET else Code.CLOCKS_DIFFER.remedy
 
 
 def _stamped(samples: SomeSamples) -> SomeSamples:
@@ -213,7 +214,7 @@ def _without_slow_changes(x: Floats, slow: float) -> Floats:
 
 def _delay(y: Floats, x: Floats, x_delay: float = 0.0) -> float:
     """
-    Return the delay of y (n, 1) against x (n, k), s; 0 if small (up to OFFSET_REACH) or uncertain.
+    Return the delay of y (n, 1) against x (n, k), s; 0 if uncertain or up to MAX_CLOCK_OFFSET.
 
     At this delay a regression on x explains the largest share of the variance of y. Rows are
     OFFSET_CELL apart.   x_delay : known delay of x, s, which is added.
@@ -229,7 +230,7 @@ def _delay(y: Floats, x: Floats, x_delay: float = 0.0) -> float:
     before, largest, after = explained[best - 1:best + 2]
     vertex = (after - before) / max(2 * (2 * largest - before - after), 1e-12)    # of a parabola
     delay_s = OFFSET_CELL * (cells[best] + np.clip(vertex, -0.5, 0.5))
-    is_small = np.abs(OFFSET_CELL * cells + x_delay) <= OFFSET_REACH
+    is_small = np.abs(OFFSET_CELL * cells + x_delay) <= MAX_CLOCK_OFFSET
     is_far = np.abs(OFFSET_CELL * cells - delay_s) > ACCELERATION_S
     samples = len(y) * OFFSET_CELL / ACCELERATION_S
     unexplained = np.maximum(1.0 - np.array([explained[is_far | is_small].max(), largest]), 1e-6)

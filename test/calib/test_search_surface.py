@@ -20,7 +20,7 @@ from odocal_ros.calib.wheel_search.minimisation import (
 from odocal_ros.calib.wheel_search.parameter_sets import parameter_sets, search_ranges, Space
 from odocal_ros.settings.config import WheelsConfig
 
-FREE, HELD = Space(fixed_difference=False), Space(fixed_difference=True)
+FREE, HELD = Space(ratio_is_fixed=False), Space(ratio_is_fixed=True)
 # on straight drives, left against right is not observable: nothing to compare
 TURNING = ['town', 'another town', 'noisy town', 'out and back']
 RANGES = search_ranges(WheelsConfig())
@@ -137,7 +137,7 @@ def test_minimum_in_a_box_is_the_least_value_there(definite):
 
 @pytest.mark.parametrize(('name', 'space'), [(name, HELD) for name in DRIVES] + [
     (name, FREE) for name in TURNING], ids=lambda x: x if isinstance(x, str) else (
-        'together' if x.fixed_difference else 'free'))
+        'together' if x.ratio_is_fixed else 'free'))
 @pytest.mark.parametrize('robust', [False, True], ids=['plain', 'robust'])
 def test_surface_and_least_squares_agree(name, space, robust):
     _, leg = simulated(**DRIVES[name])

@@ -21,7 +21,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import WheelsConfig
 
-FREE, HELD = Space(fixed_difference=False), Space(fixed_difference=True)
+FREE, HELD = Space(ratio_is_fixed=False), Space(ratio_is_fixed=True)
 RANGES = search_ranges(WheelsConfig())
 
 
@@ -29,7 +29,7 @@ RANGES = search_ranges(WheelsConfig())
 def test_left_and_right_scales_of_cars_move_together_with_a_reason(name):
     made, leg = simulated(**DRIVES[name])
     found = search(leg, RANGES)
-    assert found.fixed_difference
+    assert found.ratio_is_fixed
     ratio = found.refined_set[1] / found.refined_set[0]
     assert ratio == pytest.approx(leg.scale_right / leg.scale_left, rel=1e-12)
     codes = {r.code for r in found.reasons}
@@ -47,7 +47,7 @@ def test_left_and_right_scales_of_cars_move_together_with_a_reason(name):
 def test_small_lawn_separates_left_and_right():
     leg = on_a_plane()
     found = search(leg, RANGES)
-    assert not found.fixed_difference
+    assert not found.ratio_is_fixed
     assert found.reasons == ()
     z = (found.refined_set - TRUE) / found.free.sigma
     assert (np.abs(z) < 4).all()
@@ -99,7 +99,7 @@ def test_search_without_convergence_stops_and_is_reported():
     assert_allclose(found.refined.half_range[:2], 0.9)
     nothing = replace(leg, left_n=0 * leg.left_n, right_n=0 * leg.right_n)
     blind = search(nothing, RANGES)
-    assert blind.fixed_difference
+    assert blind.ratio_is_fixed
     assert json.loads(json.dumps(blind.as_dict(), allow_nan=False))['condition_number'] is None
     assert search(replace(leg, t=leg.t[:3], left_n=leg.left_n[:3], right_n=leg.right_n[:3],
                           fixes_n=leg.fixes_n[:3], sigma=leg.sigma[:3]), RANGES) is None

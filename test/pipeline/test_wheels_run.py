@@ -88,7 +88,7 @@ def test_the_holdout_is_not_in_the_fit_and_agrees_with_the_track(made, result):
     assert a.value != b.value
     assert a.sigma > b.sigma
     assert held.after.rms < held.before.rms / 5
-    # nothing after the begin of the holdout is in the fit
+    # nothing after the start of the holdout is in the fit
     late = made.fix.stamp_ns > made.truth.start_ns + 0.9 * (
         made.truth.stop_ns - made.truth.start_ns)
     # 127 m north

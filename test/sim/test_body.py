@@ -147,7 +147,7 @@ def test_the_imu_measures_the_motion_of_its_place_on_the_body():
     place = R @ arm
     want = np.einsum('nij,ni->nj', R, f_0 + a_arm + 2 * np.cross(w_0, rate)
                      + np.cross(dw, place) + np.cross(w_0, np.cross(w_0, place)))
-    # error of the turn rate's derivative by differences at the begin of its ramp, w" dt / 2,
+    # error of the turn rate's derivative by differences at the start of its ramp, w" dt / 2,
     # times the IMU displacement of up to 4 cm; round-off of the second difference is 1e-8
     assert_allclose(f, want, atol=(6 * 0.8 / 3.5 / 1.5**2) * 0.01 / 2 * 0.04)
 

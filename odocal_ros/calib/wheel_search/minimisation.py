@@ -134,7 +134,7 @@ class _BoxSearch:
                  width: Floats, x: Floats) -> None:
         self.criterion, self.space = criterion, space
         self.first_half_range = self.half_range = half_range
-        self.first_width = np.abs(space.q_of(width) if space.fixed_difference else
+        self.first_width = np.abs(space.q_of(width) if space.ratio_is_fixed else
                                   np.array([width[:2].mean(), width[:2].sum(), width[2]]))
         self.w = self.first_width
         self.q = space.q_of(x)
@@ -288,7 +288,7 @@ def _covariance(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
                 robust: bool) -> tuple[Floats, float]:
     """Return the covariance of x, (3, 3), and the condition number of the Jacobian."""
     w = np.tile(weights(_squared_distances(r), leg.sigma, robust), 2)
-    s = np.linalg.svd(J @ space.T if space.fixed_difference else J, compute_uv=False)
+    s = np.linalg.svd(J @ space.T if space.ratio_is_fixed else J, compute_uv=False)
     condition = float(s[0] / s[-1]) if s[-1] > 1e-15 * s[0] else np.inf
     root = np.sqrt(w)
     _, s, vt = np.linalg.svd(root[:, None] * (J @ space.T), full_matrices=False)

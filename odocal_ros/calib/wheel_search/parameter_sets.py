@@ -116,33 +116,33 @@ def design_for(levels: int) -> tuple[str, Ints]:
 class Space:
     """Linear map x = T q from search coordinates q: (mean, difference, heading) of the wheels."""
 
-    fixed_difference: bool    # True: q is (mean, heading)
+    ratio_is_fixed: bool      # True: left over right is that of the start; q is (mean, heading)
 
     @property
     def T(self) -> Floats:     # noqa: N802
         """Return the matrix of x = T q: (3, n)."""
-        return FREE[:, [0, 2]] if self.fixed_difference else FREE
+        return FREE[:, [0, 2]] if self.ratio_is_fixed else FREE
 
     @property
     def S(self) -> Floats:     # noqa: N802
         """Return the matrix, (n, n), of the bounded v = S q: v is x, or mean and heading."""
-        return np.eye(2) if self.fixed_difference else FREE
+        return np.eye(2) if self.ratio_is_fixed else FREE
 
     def q_of(self, x: Floats) -> Floats:
         """Return the coordinates q of x, (3,): (n,)."""
         left, right, heading = x
         mean = (left + right) / 2
-        return np.array([mean, heading] if self.fixed_difference else
+        return np.array([mean, heading] if self.ratio_is_fixed else
                         [mean, right - left, heading])
 
     def bounds(self, half_range: Floats) -> Floats:
         """Return the half range of v from that of x: (n,)."""
-        return np.array([min(half_range[:2]), half_range[2]]) if self.fixed_difference \
+        return np.array([min(half_range[:2]), half_range[2]]) if self.ratio_is_fixed \
             else np.array(half_range)
 
     def widened(self, half_range: Floats, on_edge: Bools) -> Floats:
         """Return the half range of x, doubled where v is on its edge, with positive scales."""
-        edge = np.array([on_edge[0], *on_edge]) if self.fixed_difference else np.asarray(on_edge)
+        edge = np.array([on_edge[0], *on_edge]) if self.ratio_is_fixed else np.asarray(on_edge)
         widest = np.array([0.9, 0.9, 1.5 * np.pi])
         return np.where(edge, np.minimum(2 * np.asarray(half_range), widest), half_range)
 

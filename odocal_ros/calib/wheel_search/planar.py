@@ -82,7 +82,7 @@ def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Fl
     track_left, track_right : dead reckoned with the travel of each wheel alone, same attitude.
     t_fix, fixes_n, covariance_n : (k,), (k, 2 or 3), (k, 3, 3) fixes, s, m, m^2; those outside
     the tracks are left out.   start : (t, position_n) time, s, and antenna position, m, at the
-    begin of the tracks.   scales : (left, right) start values, m per unit.   pitch : pitch
+    start of the tracks.   scales : (left, right) start values, m per unit.   pitch : pitch
     mounting angle, rad: the axes are those of yaw 0.   lever_v : (3,) antenna from the
     odometer's point, m.
     """

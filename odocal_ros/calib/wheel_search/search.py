@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The search of CN104359492A: an orthogonal array, then response surfaces, checked by least squares.
+Search left scale, right scale and heading as in patent CN104359492A.
 
-Heading is here the counter-clockwise rotation of the dead-reckoned track: the error of the
-configured heading minus the yaw mounting angle. Positions cannot separate the two.
+An orthogonal array is followed by response surfaces; least squares check the result. Heading is
+here the counter-clockwise rotation of the dead-reckoned track: the error of the configured heading
+minus the yaw mounting angle. Positions cannot separate the two.
 """
 
 from collections.abc import Callable
@@ -41,9 +42,10 @@ class SearchResult:
     array_name: str
     sets: Floats                # of the array's rows
     scores: Scores              # of these sets
-    best: int  # row with the least mean distance (robust: loss), of equal ones the least maximum
-    # True: the fixes do not separate left and right, whose ratio is as at the start
-    fixed_difference: bool
+    # row of the array with the smallest mean distance to the fixes (robust: smallest loss); ties:
+    # smallest maximum distance
+    best: int
+    ratio_is_fixed: bool        # True: fixes do not separate left and right: ratio as in ``start``
     refined: Refined            # by response surfaces
     direct: LeastSquares        # by least squares
     free: LeastSquares          # the same with left and right free
@@ -70,7 +72,7 @@ class SearchResult:
             'array': {'name': self.array_name, 'rows': len(self.sets),
                       'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
             'best_row': _set(self.sets[self.best]) | self.scores.row(self.best),
-            'left_and_right_held_together': self.fixed_difference,
+            'left_and_right_held_together': self.ratio_is_fixed,
             'heading_means': HEADING_MEANS,
             'response_surface': _set(self.refined_set) | {
                 'iterations': refined.iterations, 'settled': refined.converged,
@@ -114,24 +116,25 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     sets = parameter_sets(leg, x)
     scores = score(leg, sets, robust)
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
-    free = direct = least_squares(leg, x[best], Space(fixed_difference=False), robust)
-    # twice the stated error of each wheel: the sigma of their difference
-    fixed_difference = not free.sigma_difference <= float(np.hypot(*ranges.half_range[:2])) / 2
-    space = Space(fixed_difference)
-    if fixed_difference:
+    free = direct = least_squares(leg, x[best], Space(ratio_is_fixed=False), robust)
+    # half ranges are 2 sigma: the ratio is fixed if the fixes do not reduce its sigma
+    ratio_is_fixed = not free.sigma_difference <= float(np.hypot(*ranges.half_range[:2])) / 2
+    space = Space(ratio_is_fixed)
+    if ratio_is_fixed:
         direct = least_squares(leg, x[best], space, robust)
     refined = _refine(leg, x[best], ranges, space, robust)
     refined_set, direct_set = (parameter_sets(leg, fit.x)[0] for fit in (refined, direct))
     refined_set[2], direct_set[2] = wrap(refined_set[2]), wrap(direct_set[2])
     return SearchResult(
         (leg.scale_left, leg.scale_right), ranges, array_name, sets, scores, best,
-        fixed_difference, refined, direct, free, refined_set, direct_set,
+        ratio_is_fixed, refined, direct, free, refined_set, direct_set,
         score(leg, leg.start, robust), score(leg, refined_set, robust),
-        _reasons(ranges, refined, direct, free, fixed_difference))
+        _reasons(ranges, refined, direct, free, ratio_is_fixed))
 
 
 def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
-    """Return the minimum of the mean square; robust: then of Huber's mean, a cone far from it."""
+    """Return the minimum of the mean square; if robust, from there that of Huber's mean."""
+    # far from its minimum, Huber's mean is a cone, which a polynomial does not fit
     def criterion(robust: bool) -> Callable[..., Any]:
         return lambda x: score(leg, parameter_sets(leg, x), robust, course=False).loss
 
@@ -145,9 +148,9 @@ def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: boo
 
 
 def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: LeastSquares,
-             fixed_difference: bool) -> tuple[Reason, ...]:
+             ratio_is_fixed: bool) -> tuple[Reason, ...]:
     reasons = []
-    if fixed_difference:
+    if ratio_is_fixed:
         sigma = 100 * free.sigma_difference
         text = (f'determine the difference of the wheels only to {sigma:.2g} %' if sigma < 100 else
                 'do not separate left and right wheel')

@@ -135,7 +135,7 @@ def embodiment(leg: PlanarLeg, radius: float = NOMINAL_RADIUS,
     array_x, all_x = (_errors_of(rows, half_range) for rows in (array, full_factorial(LEVELS)))
     (best_x, _), (best_of_all_x, mean_distances) = (_best(leg, x) for x in (array_x, all_x))
     step = 2 * half_range / (np.array(LEVELS) - 1)
-    spaces = Space(fixed_difference=False), Space(fixed_difference=True)
+    spaces = Space(ratio_is_fixed=False), Space(ratio_is_fixed=True)
     surface, surface_together = (
         refine(lambda x: score(leg, parameter_sets(leg, x), course=False).loss, best_x, step,
                half_range, space, widen=False) for space in spaces)
