@@ -50,6 +50,9 @@ def test_slip_of_seconds_is_reported_with_place_and_size(noise, begin, length, s
     leg, pulses = slipping(leg, begin, length, share)
     method = smooth(leg, config)
     assert off(method, drive) < 3.3
+    # path per count of this leg, with slip
+    found, counts = method.estimates['scale_factor'], np.ptp(leg.travel.s)
+    assert abs(found.value - drive.truth.scale * (1 - pulses / counts)) < 2 * found.sigma
     slips = method.details['slips']
     metres = sum(s['metres'] for s in slips if begin - 2.0 <= s['t'] <= begin + length)
     # intervals that slip for a part of their second are found to nine tenths; the accelerometer

@@ -70,12 +70,13 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     # only the steps of a coarse speed are used, which do not show slip
     slip_path = None if leg.uses_speed_steps else residuals.odometer_minus_ground_path(
         fit, marginals)
-    unexplained = None if slip_path is None else residuals.find_unexplained_travel(fit, slip_path)
-    posterior = _posterior(problem, fit, factor, unexplained)
+    slips, unexplained = ((), None) if slip_path is None else (
+        residuals.find_slips(fit, slip_path, leg.travel.quantum * fit.state.scale),
+        residuals.find_unexplained_travel(fit, slip_path))
+    posterior = _posterior(problem, fit, factor, slips, unexplained)
     sigma, grade = posterior.sigma, problem.grade if leg.has_accelerometer else None
-    slips, reasons_of_slips = _find_slips(leg, fit, marginals, slip_path, sigma)
     reasons += [unexplained.reason()] if unexplained else []
-    reasons += reasons_of_slips
+    reasons += _slip_reasons(leg, fit, marginals, slips, sigma)
     reasons += remarks.remarks(problem, fit, sigma, posterior.sigma_ratio, config)
     estimates, refusals = _estimate(leg, fit, posterior, config)
     wheels, of_wheels, wheel_reasons = _estimate_wheels(
@@ -102,12 +103,15 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
                         information)
 
 
-def _posterior(problem: Problem, fit: Fit, factor: float,
+def _posterior(problem: Problem, fit: Fit, factor: float, slips: tuple[residuals.Slip, ...],
                unexplained: residuals.UnexplainedTravel | None) -> _Posterior:
     """Return covariance and sigmas of the constants, the errors beyond the fit included."""
     covariance = with_model_floor(fit.covariance * factor**2)
+    of_travel = {
+        'slip': abs(sum(slip.metres for slip in slips)) / residuals.path_length(fit),
+        'unexplained_travel': unexplained.share if unexplained else 0.0}
     beyond_fit = remarks.find_errors_beyond_fit(problem, fit, np.sqrt(np.diag(covariance)),
-                                                unexplained.share if unexplained else 0.0)
+                                                of_travel)
     for error in beyond_fit:
         covariance[error.constant, error.constant] += error.sigma**2
     return _Posterior(factor, covariance, np.sqrt(np.diag(covariance)),
@@ -179,23 +183,21 @@ def _budget(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
     return sources, information
 
 
-def _find_slips(leg: SmootherLeg, fit: Fit, marginals: JointMarginals, slip_path: Floats | None,
-                sigma: Floats) -> tuple[tuple[residuals.Slip, ...], list[Reason]]:
-    """Return the slips, and the reasons that report them and a filter of the odometer."""
+def _slip_reasons(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
+                  slips: tuple[residuals.Slip, ...], sigma: Floats) -> list[Reason]:
+    """Return the reasons that report slips, lost or added travel, and a filter."""
     filtered = remarks.filter_reasons(fit.state.constants[layout.ODO_LAG2], sigma[layout.ODO_LAG2])
-    if slip_path is None:
-        return (), list(filtered)
-    count_m = leg.travel.quantum * fit.state.scale
-    slips = residuals.find_slips(fit, slip_path, count_m)
+    if leg.uses_speed_steps:
+        return list(filtered)
     speed = np.einsum('ni,nij,j->n', fit.state.v_n, fit.state.C_nb, fit.state.forward)
     # 0: slip; else no force explains it: the odometer lost (-1) or added (1) the travel
     sign = np.array([travel_error_sign(s.t, s.duration, s.metres, fit.state.t, speed)
                      for s in slips], int)
     # a filter of unknown shape, or a late or held speed, also has errors at changes of speed
     level = '' if filtered or (sign > 0).any() else residuals.describe_slip_level(
-        fit, marginals, count_m)
+        fit, marginals, leg.travel.quantum * fit.state.scale)
     wheel_slips = tuple(slip for slip, is_other in zip(slips, sign, strict=True) if not is_other)
-    return slips, [*filtered, *residuals.slip_reasons(wheel_slips, level), *travel_reasons(
+    return [*filtered, *residuals.slip_reasons(wheel_slips, level), *travel_reasons(
         np.array([s.t for s in slips]), np.array([s.metres for s in slips]), sign)]
 
 
@@ -232,7 +234,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
                       'normalised': residuals.normalised_residuals(fit.weighted),
                       'intervals_slipping': int(
                           (fit.variance_factors[:, 0] > residuals.SLIP_VARIANCE).sum())},
-        'excitation': {'distance': float(np.linalg.norm(motion.displacement, axis=1).sum()),
+        'excitation': {'distance': residuals.path_length(fit),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float((motion.turning * motion.T[:, 0]).sum()),
                        'in_turns': problem.total_turn,

@@ -83,18 +83,17 @@ class ErrorBeyondFit(NamedTuple):
 
 
 def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats,
-                           unexplained: float) -> list[ErrorBeyondFit]:
-    """Return errors; sigma : (M,) of the constants.   unexplained : share of the travel."""
+                           of_travel: dict[str, float]) -> list[ErrorBeyondFit]:
+    """Return errors; sigma : (M,) of the constants.   of_travel : of ln K, by source."""
     by_map = sigma_by_wheels_in_map(problem, fit.state.constants, sigma)
     has_height = problem.leg.origin.is_local or not np.isnan(problem.leg.fixes_n[:, 2]).all()
     by_height = 0.0 if has_height else HEIGHT_UNKNOWN / SEMI_MAJOR_AXIS
     # which of the two values a later drive has is unknown
     of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size)) for step in
                  fit.constant_steps if step.constant != layout.LN_K and step.is_certain]
-    of_scale = [ErrorBeyondFit(layout.LN_K, name, size) for name, size in (
-        ('wheels_in_positions', by_map), ('height', by_height),
-        ('unexplained_travel', unexplained)) if size]
-    return of_scale + of_angles
+    of_scale = of_travel | {'wheels_in_positions': by_map, 'height': by_height}
+    return [ErrorBeyondFit(layout.LN_K, name, size)
+            for name, size in of_scale.items() if size] + of_angles
 
 
 def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,

@@ -150,6 +150,11 @@ def find_slips(fit: Fit, slip_path: Floats, count_m: float) -> tuple[Slip, ...]:
     return tuple(sorted(slips, key=lambda s: -abs(s.metres)))
 
 
+def path_length(fit: Fit) -> float:
+    """Return the path length of the odometer, m."""
+    return float(np.linalg.norm(fit.weighted[MotionRows].motion.displacement, axis=1).sum())
+
+
 class UnexplainedTravel(NamedTuple):
     """Travel that the fit explains by noise of one sign, docs/method.md (S31)."""
 
@@ -181,11 +186,10 @@ def find_unexplained_travel(fit: Fit, slip_path: Floats) -> UnexplainedTravel | 
     by_state = np.where(usual, -slip_path, 0.0)
     metres = float(by_state.sum())
     sigmas = metres / float(np.linalg.norm(rows.along_sigma()[usual]))
-    path = float(np.linalg.norm(rows.motion.displacement, axis=1).sum())
     if abs(sigmas) <= REMARK_SIGMAS:
         return None
     steady = abs(by_state[~hard].sum()) > abs(by_state[hard].sum())
-    return UnexplainedTravel(metres, sigmas, abs(metres) / path, bool(steady))
+    return UnexplainedTravel(metres, sigmas, abs(metres) / path_length(fit), bool(steady))
 
 
 def describe_slip_level(fit: Fit, marginals: JointMarginals, count_m: float) -> str:
