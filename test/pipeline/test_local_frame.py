@@ -14,6 +14,7 @@ import pytest
 from odocal_ros.data.samples import LOCAL_STATUS
 from odocal_ros.estimator import make_smoother_leg, prepare
 from odocal_ros.estimator.prepare import _priors
+from odocal_ros.nav import geodesy
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.geodesy import (
     earth_rate_n,
@@ -26,7 +27,6 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.output.plots import draw_track
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screening import inputs as inputs_module
 from odocal_ros.screening.inputs import locate_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.nominal import grade_of
@@ -80,7 +80,7 @@ def test_poses_give_the_values_of_fixes_with_the_earth_rate_of_the_frame(monkeyp
     made = drive(**CAR | {'fix_noise': 'white'})
     latitude, turned = made.options.latitude, math.pi / 2 - made.options.heading
     rate = earth_rate_n(latitude) @ matrix_from_rpy([0.0, 0.0, turned])
-    monkeypatch.setattr(inputs_module, 'rate_without_north', lambda latitude: PartlyKnownRate(
+    monkeypatch.setattr(geodesy, 'rate_without_north', lambda latitude: PartlyKnownRate(
         tuple(rate.tolist()), (0.0, 0.0, 0.0)))
     monkeypatch.setattr(prepare, 'drift_time', lambda leg, t: np.diff(t))
     config = settings(made, **SMOOTHER, reference__default_sigma=2.5)
