@@ -15,7 +15,7 @@ from odocal_ros.data.arrays import Floats
 # residuals
 MIN_DELAY_ROWS, MAX_DELAY_ROWS, LAGS = 60, 300, 4
 # judgement: least delay that is reported, s and sigmas. 168 simulated drives without a delay had
-# up to 0.028 s and 2.5 sigmas at their ends; of 60 others none was reported at any second
+# up to 0.028 s and 2.5 sigmas at their ends; none of 60 others reported one in any second
 MIN_DELAY, DELAY_SIGMAS = 0.04, 4.0
 # judgement: ratio of the change of acceleration within a second to the central difference over
 # two, in simulated town drives

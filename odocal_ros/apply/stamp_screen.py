@@ -12,7 +12,7 @@ LATEST_STAMP_NS = (2**31 - 5) * 10**9    # format: 32-bit seconds of a header, m
 STAMP_LIMIT_NS = 200_000_000    # judgement: lead over the least lag; age before the newest stamp
 CLOCK_SET_ROWS = 10    # judgement: consecutive rows beyond STAMP_LIMIT_NS, then the clock was set
 LAG_ROWS = 1000        # judgement: accepted rows over which the least lag increases again
-# judgement: consecutive rows of a clock step; of a permanent one
+# judgement: consecutive rows until a clock step is detected, and until it is permanent
 STEP_ROWS, PERMANENT_ROWS = 3, 50
 MIN_STEP_S = 0.03    # s, judgement: smaller shifts of the lag are no clock step
 LAG_CHANGE_NS = 1e4    # ns per row, judgement: largest change of the median lag

@@ -28,7 +28,7 @@ SIDES = ('scale_factor_left', 'scale_factor_right')
 class Vehicle:
     """A calibrated vehicle; frame v: forward, left, up; frame b: that of the IMU."""
 
-    scale: float            # m per unit of the odometer; of two wheels: of their mean
+    scale: float            # m per unit of the odometer; two wheels: of their mean
     scale_sigma: float      # relative
     wheel_scales: tuple[float, float] | None      # left and right; None: mean only
     yaw: float              # rad, mounting angles

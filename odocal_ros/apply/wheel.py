@@ -26,7 +26,7 @@ HARD_BRAKING, WHEEL_ACCELERATION = 5.0, 15.0
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
 # judgement: limit of the lateness of a row, mean jitters plus s: lost counts are not jitter
 LATENESS_RATIO, LATENESS_OFFSET = 2.0, 1e-3
-# judgement: least deviation of a counter that stops abruptly, mean jitters; of held values: 3
+# judgement: least deviation of a counter that stops abruptly, mean jitters; held values have 3
 HUNG_JITTERS = 2.0
 # judgement: rows before the first test; number of consecutive rows that are refused, and their
 # least duration, s, before one is accepted
@@ -163,7 +163,7 @@ class Wheel:
         self.s.append(self.s[-1] + step)
 
     def _sampling_time(self, t: float, value: float, before: float) -> float:
-        """Return the time of a row without the jitter of its arrival t, s; of a speed, t."""
+        """Return the time of a row without the jitter of its arrival t, s; for speeds, t."""
         if self.form.quantity == 'rate':      # speeds do not show lost rows
             self._row_times.next_time(t, min(max(value * self.scale, -FASTEST), FASTEST), 0.0, 0.0)
             return t

@@ -28,8 +28,8 @@ class McapFile(BagFile):
     A file of messages in chunks.
 
     The size, the checksum (if any), the channels and the times of each chunk are checked. A chunk
-    with any error is skipped, since other errors in it may be undetected; of a chunk truncated by
-    the end of the file, complete messages are used.
+    with any error is skipped, since other errors in it may be undetected. If the end of the file
+    truncates a chunk, its complete messages are used.
     """
 
     def __init__(self, path: Path, allowance: Allowance) -> None:

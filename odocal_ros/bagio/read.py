@@ -269,7 +269,7 @@ def _check_has_messages(path: Path | str, source: Source, parts: list[BagFile]) 
 
 
 def bag_sha256(bag: Bag) -> str:
-    """Return the SHA-256 of a bag; of several files that of the output of sha256sum for them."""
+    """Return the SHA-256 of a bag; several files: that of the output of sha256sum for them."""
     digests = []
     for path in bag.files:
         with path.open('rb') as file:

@@ -160,7 +160,7 @@ def _find_differing(legs: LinkedLegs, scatter: dict[str, float],
         return ()
     with_scatter = legs.disagreement(scatter)
     deviates = {name: deviate(name) for name in legs.names}
-    # of those without scatter, only the one that explains most of the remaining chi-square
+    # without scatter, only the constant that explains most of the remaining chi-square
     others = [name for name in legs.names if name not in scatter]
     tested = [*scatter, *([max(others, key=deviates.__getitem__)] if others else [])]
     return tuple(name for name in tested if deviates[name] > DIFFERENCE_DEVIATE)

@@ -39,7 +39,7 @@ class MarginalInformation:
     gradient: Floats         # (m,)
     prior_mean: Floats       # (m,)
     prior_sigma: Floats      # (m,) inf: no prior
-    # (m,) the same, widened if the leg contradicts it; of imperfections, their estimated size
+    # (m,) the same, widened if the leg contradicts it; imperfections: their estimated size
     relaxed_sigma: Floats
     # (SCATTER_POINTS,) each: log likelihood of the scatter between combined legs, by name (S38)
     scatter_likelihood: dict[str, Floats] = field(default_factory=dict)

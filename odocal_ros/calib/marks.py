@@ -87,7 +87,7 @@ def _variance_share(t: Floats, residual: Floats, fix_covariance: Floats, weight:
         return _mean_variance_share(t, weight, correlation_time)
     if n < MIN_SCATTERED_FIXES:
         return 1.0
-    # of white errors, both of these are 1, within 3 sigma of their own noise
+    # for white errors, both of these are 1, within 3 sigma of their own noise
     z = residual[:, :2] / np.sqrt(np.diag(fix_covariance))[:2]
     scatter = (z**2).sum() / (2 * (n - 1))
     half_square_step = (np.diff(z, axis=0)**2).mean() / 2

@@ -104,7 +104,7 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
     # passes in which outliers are updated: the residuals of earlier ones contain errors of the
     # initial state; after the last one outliers must be constant to converge
     outlier_passes = range(1 if warm_start else 3, 16)
-    # pass that estimates the effective sample size; of two starts only that of the better one
+    # pass that estimates the effective sample size; with two starts, only for the better one
     sample_size_pass = 3 if warm_start is None else 0 if problem.rows_per_independent else 1
     level_steps = LevelSteps(problem)
     progress = Progress(warm_start is not None, frozen, outlier_passes.start + 2)

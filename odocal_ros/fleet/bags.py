@@ -196,7 +196,7 @@ def _check_disk_space(url: str, fs: Any, path: str, folder: str) -> None:
 
 @contextmanager
 def local_copy(url: str, scratch: str | None) -> Iterator[Path]:
-    """Yield a local path of a bag; of a remote one, that of a temporary copy in ``scratch``."""
+    """Yield a local path of a bag; if it is remote, of a temporary copy in ``scratch``."""
     fs, path = file_system(url)
     if is_local(url):
         yield Path(path)

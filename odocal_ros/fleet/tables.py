@@ -49,7 +49,7 @@ def value_cells(estimates: dict[str, Estimate]) -> dict[str, Any]:
 
 
 def table_rows(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
-    """Return the legs of a bag's row as rows of a table; of a failed bag a row without values."""
+    """Return the legs of a bag's row as rows of a table; for a failed bag, one without values."""
     bag_cells = {'status': row.status, 'reason': row.reason}
     return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | bag_cells
             for k, leg in enumerate(legs_from_text(row.legs), 1)] or [

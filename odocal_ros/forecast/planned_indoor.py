@@ -141,7 +141,7 @@ class Robot:
 
     drive: str                      # as odometer.drive
     imu: bool                       # it has an IMU
-    # m, track width, of skid steering in turns on the spot; of HOLONOMIC twice the rotation lever
+    # m, track width; skid steering: in turns on the spot; HOLONOMIC: twice the rotation lever
     width: float
     straight_width: float = 0.0     # m, track width of skid steering on a straight
     wheels: int = 2

@@ -264,8 +264,8 @@ class Plan:
         """
         Return the reasons of the prediction.
 
-        Those of the drive, of the smoother, and of methods that give a parameter; of the other
-        methods the refusals only.
+        All reasons of the drive, the smoother, and methods that give a parameter; only refusals of
+        the other methods.
         """
         reasons = list(self.two_point.drive_reasons)
         for name in self.methods:

@@ -86,7 +86,7 @@ def from_scenario(name: str, duration: float | None) -> PlannedDrive:
 
 def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
     """
-    Return the drive of a GPX track; of a route without times at ``speed`` m/s.
+    Return the drive along a GPX track; if it has no times, at ``speed`` m/s.
 
     Raises BadUsage: the file cannot be read, is no GPX, has too few points, or lacks times and no
     speed is given.

@@ -199,7 +199,7 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     at start and end (default 30), m/s^2 (default 1): a drive by its figures.   scenario,
     duration : name of a simulated drive, and its duration, s.   gpx : a GPX track; one without
     times is driven at ``speed``.
-    bag, topics : a recorded bag, with the accuracy and rate of its fixes; of a journal with its
+    bag, topics : a recorded bag, with the accuracy and rate of its fixes; a journal also has its
     settings and topics.   config : as ``calibrate_bag``: IMU grade, heading source and the like.
     errors : fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per
     count, sway m/s, slip m/sqrt(s).

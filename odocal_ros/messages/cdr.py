@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# format: types of numpy by those of fields, in bytes; of struct by numpy (uint64 read as int64)
+# format: numpy types by field types; then struct types by numpy types (uint64 is read as int64)
 NUMPY_TYPES = {f'{kind}{8 * size}': f'<{kind[0]}{size}' for kind, size in (
     *product(('int', 'uint'), (1, 2, 4, 8)), ('float', 4), ('float', 8))}
 STRUCT_FORMATS = {'i1': 'b', 'u1': 'B', 'i2': 'h', 'u2': 'H', 'i4': 'i', 'u4': 'I', 'i8': 'q',

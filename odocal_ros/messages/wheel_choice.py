@@ -5,7 +5,7 @@
 Selection of the wheels among the values of a message, if no setting names them.
 
 Joints are selected by name: wheels, steering and arm joints have typical names. A left and a right
-one are a pair; of several axles the one that does not steer is used, otherwise the rear one.
+one are a pair. Of several axles, the one that does not steer is used, otherwise the rear one.
 Without typical names, two values of unknown sides give their mean, more are refused.
 """
 

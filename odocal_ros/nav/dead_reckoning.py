@@ -148,10 +148,10 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
     """
     Return metres per unit of travel from distances between fixes, None without motion.
 
-    It is the median of equal sections of the path, as short as possible with chords of at least
-    ``min_chord``, m, and of eight sigmas. Despite outliers its error is a few per cent: enough for
-    thresholds and for scales without a nominal value. If the path folds back within ``min_chord``
-    (the lanes of a mower), the ratio of shorter sections is larger and is used.
+    It is the median over sections of equal path length, as short as possible with chords of at
+    least ``min_chord``, m, and of eight sigmas. Despite outliers its error is a few per cent:
+    enough for thresholds and for scales without a nominal value. If the path folds back within
+    ``min_chord`` (the lanes of a mower), the ratio of shorter sections is larger and is used.
     """
     inside = (t_fix >= travel.t[0]) & (t_fix <= travel.t[-1]) if len(travel.t) else []
     if not np.any(inside):

@@ -17,7 +17,7 @@ Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
 # judgement: quaternions that a scan multiplies in sequence; 40 to 800 are equally fast
 SCAN_BLOCK = 64
 SAMPLES_AT_A_TIME = 16384    # judgement: intervals at a time, whose arrays stay in the cache
-MIN_INTERVAL = 1e-9    # s; judgement: of the stamps, keeps the slope of equal stamps finite
+MIN_INTERVAL = 1e-9    # s, between stamps; judgement: keeps the slope finite if stamps are equal
 # judgement: largest ratio of adjacent intervals for a cubic through them
 EVEN_RATIO = 2.0
 

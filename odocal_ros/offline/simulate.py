@@ -21,7 +21,7 @@ from odocal_ros.settings.levels import DAY_NS
 if TYPE_CHECKING:
     from odocal_ros.sim.options import SimOptions
 
-# options that are fields of SimOptions: metavar and help; of angles, in degrees, only the help
+# options that are fields of SimOptions: metavar and help; angles, in degrees, have only the help
 NUMBER_OPTIONS = {
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
     'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),

@@ -87,7 +87,7 @@ def svg(figure: Any, name: str, description: str) -> str:
 
 
 def peak_rows(y: Floats) -> Ints:
-    """Return rows, (m,) int, of a line: both ends, the least and greatest y of equal blocks."""
+    """Return rows of a line, (m,) int: both ends, and the extreme y of blocks of equal size."""
     y = np.asarray(y, float)
     n = len(y)
     if n <= MAX_POINTS:

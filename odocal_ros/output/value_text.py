@@ -153,7 +153,7 @@ def _name_legs(group: list[tuple[Reason, list[str]]]) -> list[Reason]:
     reason, numbers = group[0]
     if not numbers[0]:
         return [reason]
-    max_listed = 2    # different texts of a code; of more, the first one is shown
+    max_listed = 2    # different texts of a code; if there are more, the first one is shown
     if len(group) <= max_listed:
         return [replace(one, text=f'{_legs_text(legs)}: {one.text}') for one, legs in group]
     all_legs = sorted({int(n) for _, legs in group for n in legs})

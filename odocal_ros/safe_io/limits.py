@@ -86,7 +86,7 @@ class Allowance:
     def unpack(self, packing: str, data: bytes | bytearray | memoryview, size: int | None = None
                ) -> bytes | bytearray | memoryview:
         """
-        Return decompressed data; of a truncated stream, the part that exists.
+        Return decompressed data; if the stream is truncated, the part that exists.
 
         packing : '', 'zstd', 'lz4' or 'bz2'.   size : stated number of bytes, if any. Raises
         LimitReached; Damaged: another packing, or more than ``size`` bytes; or an error of the

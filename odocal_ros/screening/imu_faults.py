@@ -176,7 +176,7 @@ def _share_of_second_imu(x: Floats) -> float:
     size = np.abs(difference).max(axis=1)
     usual = size <= OUTLIER_RATIO * np.median(size)
     mean = x[1:count * MEAN_ROWS + 1].reshape(blocks.shape).mean(axis=1)[usual]
-    # blocks of equal noise: one that tilts and vibrates more would dominate the fit
+    # scale blocks to equal noise: one that tilts and vibrates more would dominate the fit
     blocks, design = blocks[usual], np.column_stack([np.ones(len(mean)), mean])
     noise = np.sqrt((blocks**2).mean(axis=(1, 2)))
     noise = np.maximum(noise, np.median(noise) or 1.0)[:, None]

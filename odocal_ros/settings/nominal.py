@@ -151,7 +151,7 @@ def with_grade_by_noise(imu: ImuConfig, variance: Mapping[str, float]) -> ImuCon
         return sum(abs(math.log(max(sigma, 1e-12) / math.sqrt(variance[name])))
                    for name, sigma in stated.items() if name in variance)
 
-    # of equal ones the first: the configured grade
+    # if several are equally good, the configured grade, which is the first one
     return min((replace(imu, grade=name) for name in reversed(not_better)), key=misfit)
 
 

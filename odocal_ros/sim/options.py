@@ -87,7 +87,7 @@ class SimOptions:
     odometer: str = 'counts'               # counts, speed or angle (JointState position)
     odometer_rate: float = 50.0            # Hz
     odometer_delay: float = 0.0            # s, delay of the stamps
-    odometer_lever_arm: Vector = ZEROS3     # wheel contact point; of two wheels: their middle
+    odometer_lever_arm: Vector = ZEROS3     # wheel contact point; two wheels: their middle
     scale: float = BY_SCENARIO             # m/pulse, 1 or m/rad: the true value
     nominal_scale: float = BY_SCENARIO     # as configured by the operator
     speed_noise: float = 0.0               # m/s, white; only for odometer = speed

@@ -44,7 +44,7 @@ class Truth:
     real_sensors.py), which equal those of its housing if its axes are perpendicular.
     """
 
-    scale: float                 # m/pulse, 1 or m/rad; of two wheels that of their mean count
+    scale: float                 # m/pulse, 1 or m/rad; two wheels: that of their mean count
     scale_ratio: float           # K / K0
     wheel_scales: tuple[float, ...]
     yaw: float                   # rad, mounting

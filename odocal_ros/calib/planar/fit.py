@@ -22,8 +22,8 @@ from odocal_ros.calib.planar.run import Fit, PriorKnowledge, Run
 from odocal_ros.data.arrays import Floats
 
 # first levels and medians of their hyperpriors, variances. Per metre of wheel path, in m^2: slip
-# along it, to the side, in turns, and in turns on the spot; of positions: correlated error, m^2,
-# and factors on the stated variances of positions and gyro. Judgement: wheels slip by millimetres
+# along it, to the side, in turns, and in turns on the spot. Correlated error of positions, m^2;
+# factors on the stated variances of positions and gyro. Judgement: wheels slip by millimetres
 # in a metre, robots by less to the side; positions: noise and drift of a SLAM
 LEVELS = {'along': 2e-3**2, 'side': 1e-3**2, 'turn': 4e-3**2, 'spin': 4e-3**2, 'drift': 1e-2**2,
           'white': 1.0, 'gyro': 1.0}

@@ -44,7 +44,7 @@ def wheel_rows(kind: str, count: int, offset: float = 0.0) -> Floats:
 class Wheels:
     """Increments of w wheels in n intervals."""
 
-    count: Floats  # (n, w) scale units; of differential and skid drives the means of both sides
+    count: Floats  # (n, w) scale units; differential and skid drives: the means of both sides
     rows: Floats   # (w, 3) of ``wheel_rows``, whose columns are orthogonal
     kind: str      # as odometer.drive
 

@@ -126,7 +126,7 @@ def _entry(value: float, unit: str) -> dict[str, Any]:
 
 def _housing_sigma(error: float, error_sigma: float, sigma: float, misalignment: float) -> float:
     """Return the sigma of a mounting angle of the IMU housing, from that of its sensor axes."""
-    # they differ by one of two axis errors of equal size, whose sum is ``error``
+    # two axis errors with the same prior have the sum ``error``; one of them is the difference
     if not misalignment:
         return sigma
     posterior_share = min(1.0, error_sigma**2 / (2 * misalignment**2))
