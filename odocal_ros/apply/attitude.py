@@ -96,8 +96,8 @@ def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int)
             right_weight = weight * (between / 2 + before)
             for i, (a, b, c, d) in enumerate(zip(w[k - 1], first, second, w[k + 2], strict=True)):
                 slope = rise[i] / between
-                # curvatures as second divided differences; sag: line minus cubic in the middle,
-                # of which the mean is 2/3
+                # curvatures as second divided differences; sag: line minus cubic in the middle;
+                # its mean over the interval is 2/3 of that
                 left = (slope - (b - a) / before) / (before + between)
                 right = ((d - c) / after - slope) / (between + after)
                 sag = left * left_weight + right * right_weight

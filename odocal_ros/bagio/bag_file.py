@@ -159,7 +159,7 @@ def is_valid_time(time_ns: int) -> bool:
 
 
 def in_batches(stream: Iterator[tuple[Any, ...]]) -> Iterator[Batch]:
-    """Yield the messages of a stream as of ``BagFile.messages``, many at a time, by topic."""
+    """Yield messages of a stream like ``BagFile.messages``, many at a time, by topic."""
     while batch := _next_batch(stream):
         yield batch
 

@@ -21,7 +21,7 @@ LEAF = b'\x0D'      # format: first byte of a page with rows, sqlite.org/filefor
 COLUMN_COUNT = 4
 # format: bytes of an integer, by the type code in a row
 INTEGER_BYTES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
-# what is raised if bytes that are read as a row are none, or a part of it is missing
+# errors raised if the bytes are not a row, or a part of the row is missing
 NO_ROW = (ValueError, IndexError, struct.error)
 
 

@@ -129,7 +129,7 @@ class Uncertainties:
     fix_scale: Floats           # (3,) factor on the stated sigmas of the fixes, east, north, up
     quantum: float              # m, size of a count of the odometer
     time_sigma: float           # s, of the unknown delay of the fixes
-    odometer_time_sigma: float  # s, of that of the odometer
+    odometer_time_sigma: float  # s, of the unknown delay of the odometer
     lever_arm_sigma: float      # m, of the antenna, each axis
 
 

@@ -61,7 +61,8 @@ def choose(methods: Mapping[str, MethodResult],
     """
     Return each parameter from the first method that has it and is not rejected.
 
-    Also returns the names of the methods that gave a value; if none did, of the first usable one.
+    Also returns the names of the methods that gave a value; if none did, the name of the first
+    usable one.
     methods : by name.   method_setting : the setting ``method``, or the methods.
     """
     results = [methods[name] for name in dict.fromkeys((*deciding_methods(method_setting), PLANAR))

@@ -128,7 +128,7 @@ def _without_slips(pair: WheelPair, events: list[Event]) -> WheelPair:
 def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
                  width: float) -> tuple[list[Event], list[Event]]:
     """Return the steps of the residual, (n,) m, that end, and those that may change the ratio."""
-    # a step is a jump between two means of the residual, at several distances of these, that is
+    # a step is a jump between two means of the residual, with several gaps between them, that is
     # larger than by chance. quantum_m, width : size of a count, track width, m
     residual = _without_slope(pair, residual, quantum_m)
     total = running_sum(residual)

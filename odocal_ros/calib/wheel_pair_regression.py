@@ -31,7 +31,7 @@ MAX_DRIFT = np.deg2rad(2.0)
 # judgement: steps of the pair, 0.1 s each, over which speed and turn rate are averaged; also a
 # cell of the fit
 MEAN_STEPS = 10
-MIN_FIT_CELLS = 20      # judgement: of a fit
+MIN_FIT_CELLS = 20      # judgement: least number of cells of a fit
 # priors of the fit: s, sigma of the delay between the wheels, and of wheels to IMU, by drivers'
 # delays; s^2/m, sigma of the change of rolling radius by sideways acceleration. Physical
 PAIR_DELAY_SIGMA, LOAD_SIGMA = 0.05, 2e-3

@@ -5,7 +5,7 @@
 
 from typing import NamedTuple
 
-# slots of the wheels, in the order of odometer.wheels. Judgement: at most 8, as of an 8x8 truck
+# slots of the wheels, in the order of odometer.wheels. Judgement: at most 8, as in an 8x8 truck
 WHEELS = ('odometer', 'odometer_right', *(f'odometer_{k}' for k in range(3, 9)))
 
 

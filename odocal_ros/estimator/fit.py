@@ -47,7 +47,7 @@ TAIL_LIMITS = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU), 20.06, TAIL
 # one scale sigma of 60 is doubled (docs/decisions/0016). It is 0 for a bias that steps, which the
 # intervals after it observe
 MIN_OBSERVED = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU[2:]), 0.0, 0.02)
-WARM_START_PASSES = 6    # judgement: of a fit that starts from a converged one
+WARM_START_PASSES = 6    # judgement: largest number in a fit that starts from a converged one
 
 
 @dataclass(frozen=True, eq=False)

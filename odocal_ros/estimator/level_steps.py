@@ -26,7 +26,7 @@ from odocal_ros.nav.time_series import NORMAL_MEDIAN
 
 # spans in a leg, minimum: statistical, with two axes, the sigma of their variance is then 35 %
 MIN_SPANS = 8
-# components, of east, north, up, of the levels of the correlated fix error
+# components of (east, north, up) to which each level of the correlated fix error applies
 SLOW_COLUMNS = {'slow': slice(0, 2), 'slow_up': slice(2, 3)}
 # judgement: initial exponent h of (S27), since the fixed-point iteration converges slowly for
 # small noises (from 2 on a single level oscillates), and the largest one

@@ -107,8 +107,8 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
 
     gyro_bias, accel_bias : (K, 3) of each interval, subtracted.   travel : function of times, (m,)
     s, in scale units.   forward : (3,) scale times forward axis, for S_by_gyro.   t_points : (m,)
-    sorted times between the first and the last keyframe.   constants : (M,), errors GYRO and ACCEL
-    of which are subtracted.
+    sorted times between the first and the last keyframe.   constants : (M,), whose errors GYRO and
+    ACCEL are subtracted.
     """
     out, points = [], []
     K = len(imu.keyframes) - 1

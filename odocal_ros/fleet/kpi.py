@@ -31,7 +31,7 @@ MIN_LEGS = 3                  # judgement: legs of a reference; a tested leg is 
 MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: upper ends of the rows of the table
 # rates of a row; recall and false reject refer to good vehicles, false accept to bad ones
 SHARES = ('precision', 'recall', 'false_accept', 'false_reject', 'undecided')
-KPI_WIDTHS = 10, 7, 11, 9, 14, 14, 11     # definition: of the columns of the table
+KPI_WIDTHS = 10, 7, 11, 9, 14, 14, 11     # definition: widths of the columns of the table
 Limits = dict[str, tuple[float, float]]
 
 

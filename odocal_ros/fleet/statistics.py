@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from odocal_ros.nav.time_series import NORMAL_MEDIAN
 
 Floats = NDArray[np.float64]
-# statistical: of a vehicle from the mean of its vehicle model; by chance 1 in 16,000
+# limit of a vehicle's deviation from the mean of its model. Statistical: by chance 1 in 16,000
 MODEL_OUTLIER_SIGMAS = 4.0
 MIN_VEHICLES = 3            # judgement: for a spread
 

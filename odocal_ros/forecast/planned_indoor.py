@@ -40,7 +40,7 @@ PATTERNS = 'straight', 'square', 'figure_eight', 'spot'
 Move = tuple[float, float, float]      # simultaneously m forward, m to the left, rad to the left
 # m^2/m, judgement: usual in fits of robots without sideways slip, 0.3 mm in a metre
 NO_SIDE_SLIP = 1e-7
-FASTEST_NODES = 10.0       # Hz, definition: of positions that the planar estimator uses
+FASTEST_NODES = 10.0       # Hz, definition: highest rate of positions used by the planar estimator
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def pattern_motion(name: str, size: float, rounds: int, drive: str,
         if drive in settings.HOLONOMIC and not move[2]:
             moves.append((0.0, side * size / 2, 0.0))
             side = -side
-    longest_move = 36_000.0 / len(moves)      # s, judgement: ten hours, as of other planned drives
+    longest_move = 36_000.0 / len(moves)      # s, judgement: ten hours, as in other planned drives
     if size / speed > longest_move:
         raise BadUsage(f'--size {size:g} at --speed {speed:g}: more than ten hours')
     return _drive_moves(moves, speed)

@@ -136,7 +136,7 @@ def _calibrate_bags(paths: list[Path], request: _Request,
 
 def _calibrate_one_bag(path: Path, request: _Request, previous_unit: str | None,
                        listener: arguments.Listener) -> _BagLegs:
-    """Read a bag and calibrate its legs; previous_unit: of the scale in the bags before."""
+    """Read a bag and calibrate its legs; previous_unit: scale unit of earlier bags."""
     bag = read_bag(path, request.topics, request.config, listener=listener)
     unit = bag.form.scale_unit
     if previous_unit and unit != previous_unit:

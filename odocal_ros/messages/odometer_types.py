@@ -186,7 +186,7 @@ class OdometerPlan:
         return OdometerForm(quantity, modulus, unit)
 
     def _path(self, field: str, key: str) -> str:
-        """Return the path of a wheel's value: of a key in the field, or the key as path."""
+        """Return the path of a wheel's value: a key in the field; without a field, the key."""
         if not key:
             return field
         return f'{_split_key(field)[0]}[{key}]' if field else key

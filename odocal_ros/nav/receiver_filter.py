@@ -45,7 +45,7 @@ def filter_error(t: Floats, position: Floats, velocity: Floats, times: Floats,
         rate = error(small) / small
         return rate * lag_square, rate
     value = error(lag_square)
-    lag2_step = 1e-4    # relative, of the difference that gives a derivative
+    lag2_step = 1e-4    # relative step of the difference that gives a derivative
     return value, (error(lag_square * (1 + lag2_step)) - value) / (lag_square * lag2_step)
 
 

@@ -112,7 +112,7 @@ def has_position(fix: FixSamples) -> Bools:
 
 
 def _far_from_median(fix: FixSamples, good: Bools) -> Bools:
-    """Return a mask of good fixes far from the median of these: (n,) bool."""
+    """Return a mask of good fixes far from the median of the good ones: (n,) bool."""
     is_far = np.zeros(len(good), bool)
     if good.any():
         r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)

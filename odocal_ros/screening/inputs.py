@@ -119,7 +119,7 @@ def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
 
 def median_origin(t_fix: Floats, geodetic: Floats) -> Origin:
     """
-    Return the origin of n: the median fix of those near the start, so it is not an outlier.
+    Return the origin of n: the median of the fixes near the start, so it is not an outlier.
 
     t_fix : (k,) s since the start mark.   geodetic : (k, 3) latitude, longitude, rad, height, m.
     """

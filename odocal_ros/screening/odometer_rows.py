@@ -106,7 +106,7 @@ def repeated_counts(value: Values, modulus: int) -> Bools:
     size = np.abs(counter_steps(value, modulus))
     update = np.flatnonzero(size) + 1
     interval_rows = np.diff(update)
-    # judgement: rows without counts between smaller updates, of one count and two, are slow motion
+    # judgement: rows without counts between updates of only one or two counts are slow motion
     min_counts = 3.0
     if len(update) < MIN_STEPS or np.median(interval_rows) < 2 or (
             np.median(size[update - 1]) < min_counts * size[update - 1].min()):

@@ -162,8 +162,8 @@ def _fit_right_wheel(design: Floats, y: Floats, min_sigma: float) -> tuple[Float
     Return the coefficients of left wheel, turn and time in the right wheel, and their covariance.
 
     design : (n, 3) travel of the left wheel, turn, rad, duration, s, of each cell.   y : (n,)
-    travel of the right wheel.   min_sigma : least sigma of y. Of two robust fits, one of which
-    starts without turns, the one with fewer outliers is used.
+    travel of the right wheel.   min_sigma : least sigma of y. There are two robust fits,
+    one of which starts without turns; the one with fewer outliers is used.
     """
     rolling = design[:, 0] != 0
     usual = float(np.median(y[rolling] / design[rolling, 0])) if rolling.any() else 1.0

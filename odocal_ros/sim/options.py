@@ -30,7 +30,7 @@ class Reference:
 
     topic: str
     encoder: str            # function of ``bagio.encode``
-    is_planar: bool = False         # z is 0, as of 2D SLAM
+    is_planar: bool = False         # z is 0, as from 2D SLAM
     has_covariance: bool = False
     options: dict[str, Any] = field(default_factory=dict)      # usual SimOptions of this kind
 

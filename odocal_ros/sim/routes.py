@@ -5,7 +5,7 @@
 Named routes of simulated drives: speed and turn rate by time, with stops, ramps and turns.
 
 In: a duration, s, and random numbers. Out: a ``Route``. ``speed`` and ``rate`` of a segment are
-the pieces of acceleration and turn rate, of equal duration.
+the pieces of acceleration and turn rate; both have the same duration.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.errors import BadUsage
 from odocal_ros.sim.profile import chain, hold, Piece, Profile, ramp, turn
 
-# judgement: of a run of a minute with a small robot
+# judgement: for a run of a minute with a small robot
 STILL = 5.0            # s at standstill, at the start and at the end
 LONGEST_CYCLE = 19.0   # s of a cycle with the shortest straight
 BLEND = 0.4            # s, rise time of an acceleration or a turn rate
@@ -168,7 +168,7 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
 
     In each move one turn of up to 120 deg at 10 to 40 deg/s; then 3 to 9 s still.
     """
-    longest = 40.0    # s, of a move with the stop after it
+    longest = 40.0    # s, duration of a move with the stop after it
     remaining = _remaining_time('yard', duration, 20 + 15, least=longest)
     segments = [_standstill(20)]
     while remaining >= longest:

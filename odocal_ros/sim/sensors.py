@@ -25,7 +25,7 @@ from odocal_ros.sim.options import REFERENCES, SIM_GRADES, SimOptions
 from odocal_ros.sim.real_effects import ZEROS3
 
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
-WHITE_SHARE = 0.2        # judgement: of the correlated sigma: additional receiver noise
+WHITE_SHARE = 0.2        # judgement: white receiver noise over the sigma of correlated errors
 SIGMA_FLOOR = 0.001      # m, judgement: no receiver reports zero
 MOTION_LIMIT = 1e-9      # m/s and rad/s, judgement
 

@@ -37,7 +37,7 @@ STUDENT_FREEDOM = 4.0
 SPEED_IN_MOTION, SPEED_AT_REST = 0.1, 1e-3
 MIN_LEVEL = 1e-4  # judgement: lowest level, over its median: no sensor is without noise
 MAX_PASSES = 80
-# judgement: of a fit that has converged: sigmas of a constant, logarithm of a level
+# judgement: for a converged fit; sigmas of a constant, or logarithm of a level
 LARGEST_LAST_STEP = 0.02
 
 

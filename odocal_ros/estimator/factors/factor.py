@@ -26,9 +26,9 @@ from odocal_ros.estimator.state import Priors, SIZE_WITH_SLOW, SIZE_WITHOUT_SLOW
 
 # levels of the IMU: white noises, and random walks of its biases
 IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
-# variance factors of an outlier interval, h of (S13): of the odometer forward, sideways and up
-# (slips), of the noises of the IMU (kerbs, aliased vibration; biases that step), and of the noise
-# that drives the correlated fix error (jumps of the receiver)
+# variance factors of an outlier interval, h of (S13), for the odometer forward, sideways and up
+# (slips), the noises of the IMU (kerbs, aliased vibration; biases that step), and the noise that
+# drives the correlated fix error (jumps of the receiver)
 VARIANCE_FACTORS = ('along', 'side', 'up', *IMU, 'jump')
 VARIANCE_FACTOR_COUNT, JUMP = len(VARIANCE_FACTORS), VARIANCE_FACTORS.index('jump')
 ACCEL_NOISE = VARIANCE_FACTORS.index('accel')

@@ -69,7 +69,7 @@ TURNING_RATE = 0.05
 MIN_REST_NOISE = 5e-4
 # rad/s, m/s^2, 1 sigma of the unknown motion within a gap: judgement, of a car in town
 GAP_RATE, GAP_FORCE = 0.1, 1.5
-ABSENT_VARIANCE = 1e4   # m^2, of travel that is not observed
+ABSENT_VARIANCE = 1e4   # m^2, variance of travel that is not observed
 
 
 def total_turn(leg: SmootherLeg, imu: ImuSteps) -> float:

@@ -42,7 +42,7 @@ THIRD_DERIVATIVE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / STENCIL_REACH**3
 # ages less their mean, and weights
 FILTER_AGES, FILTER_WEIGHTS = np.polynomial.laguerre.laggauss(5)[0] - 1, \
     np.polynomial.laguerre.laggauss(5)[1]
-MIN_READING_NOISE = 1e-3    # m, physical: of a reading of the best odometers of today
+MIN_READING_NOISE = 1e-3    # m, physical: noise of a reading of the best odometers
 MIN_FILTER_TIME = 0.2      # s, judgement: speeds closer in time differ by vibration
 
 

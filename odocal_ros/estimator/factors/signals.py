@@ -55,7 +55,7 @@ class Signals:
         part = self.motion.take(rows)
         noise = rotate(transpose(part.C), part.residual[:, layout.PHI]) / part.T * part.fitted
         rate = part.sums.mean_rate + noise
-        # (rad/s)^2, of a rate that is likely noise
+        # (rad/s)^2, limit for a rate that is likely noise
         limit = (LIKELY_NOISE**2 * (gyro[:, layout.PHI]**2).sum(axis=(1, 2))[:, None] / 3
                  / part.T**2)
         noise -= rate * limit / (rate**2 + limit)

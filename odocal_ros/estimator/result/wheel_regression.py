@@ -22,8 +22,8 @@ UNUSABLE_WALK_TIME = 1e10   # s, definition: ``Increments.walk_time`` without in
 # judgement: prior sigmas of the logarithms of the levels: mean of the walks about the initial
 # value, each walk about their mean, and reading errors about those of rounding
 WALK_SPREAD, WALK_DIFFERENCE_SPREAD, READING_SPREAD = 7.0, 1.0, 0.5
-# of those logarithms, definition: wheels of a forecast have no noise, and their levels would
-# decrease until the equations are singular
+# lower limit of these logarithms, definition: wheels of a forecast have no noise, and their levels
+# would decrease until the equations are singular
 MIN_LOG_LEVEL = -20.0
 # judgement: iterations of the search for outliers, until variances change by less than a tenth;
 # each removes nine tenths of their effect on a level
