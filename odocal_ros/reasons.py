@@ -116,7 +116,7 @@ class Code(Enum):
                          'together.')
     GYRO_AXES = REJECT, ('Correct the axes of angular_velocity in the IMU driver. '
                          'imu.mounting_rpy cannot: it rotates gyro and accelerometer together.')
-    BAG_TRUNCATED = CAUTION, ('Stop recordings with Ctrl-C. A damaged chunk is an error of '
+    BAG_TRUNCATED = CAUTION, ('Stop recordings with Ctrl-C. An invalid chunk is an error of '
                               'storage or transfer: copy the file again. All readable messages '
                               'were used.')
     STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg. Data up to the '

@@ -61,7 +61,7 @@ class McapFile(BagFile):
         footer = data[-mcap.FOOTER_SIZE:]
         if footer[-len(mcap.MAGIC):] != mcap.MAGIC or (
                 footer[:mcap.RECORD.size] != mcap.RECORD.pack(mcap.FOOTER, 20)):
-            raise Damaged('cut off')
+            raise Damaged('truncated')
         start, _, crc = struct.unpack('<QQI', footer[mcap.RECORD.size:-len(mcap.MAGIC)])
         if not start:
             return False
@@ -194,7 +194,7 @@ class McapFile(BagFile):
                     self._add_definition(op, body)
             except (Damaged, struct.error, UnicodeDecodeError) as error:
                 self._report_damage(
-                    error if isinstance(error, Damaged) else Damaged('a damaged record'))
+                    error if isinstance(error, Damaged) else Damaged('invalid record'))
 
     def _messages_by_scan(self, chunk: mcap.Chunk, is_truncated: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time, from a sequential scan."""
@@ -232,7 +232,7 @@ class McapFile(BagFile):
         """Return the message in the content of a record; raise Damaged or struct.error."""
         number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
         if number not in self._channels or time_ns >= LATEST_NS:
-            raise Damaged('a damaged record')
+            raise Damaged('invalid record')
         return time_ns, number, body[mcap.MESSAGE_HEAD.size:]
 
     def _add_definition(self, op: int, body: bytes) -> None:

@@ -22,8 +22,8 @@ MAGIC = b'\x89MCAP0\r\n'
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = (
     2, 3, 4, 5, 6, 7, 8, 11)
 USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
-INDEX_DAMAGED = 'a damaged index'
-CHUNK_DAMAGED = 'a damaged chunk'
+INDEX_DAMAGED = 'invalid index'
+CHUNK_DAMAGED = 'invalid chunk'
 MAX_TRUNCATED = 2**26    # judgement: bytes used of a chunk that the end of the file truncates
 RECORD = struct.Struct('<BQ')               # before each record: opcode, size of its content
 # first fields of the content of records

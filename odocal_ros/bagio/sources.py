@@ -134,7 +134,7 @@ def _read_metadata(path: Path) -> BagMetadata:
     """Return the content of a metadata.yaml; with ``fault`` if it is invalid."""
     import yaml
     if not limits.is_file(path):
-        return BagMetadata(fault=f'{path}: is not a regular file and is ignored')
+        return BagMetadata(fault=f'{path} is not a regular file; it is ignored')
     try:
         return _parse_metadata(yaml.load(limits.read_text(path), Loader=safe_loader(aliases=True)))
     except (OSError, MemoryError):
@@ -144,7 +144,7 @@ def _read_metadata(path: Path) -> BagMetadata:
     except Exception as error:      # any error: types, numbers, nesting, encoding
         cause = ' '.join(str(error).split())[:100] if isinstance(error, yaml.YAMLError) else (
             'not the structure that rosbag2 writes')
-        return BagMetadata(fault=f'{path}: cannot be parsed ({cause}) and is ignored')
+        return BagMetadata(fault=f'{path} cannot be parsed ({cause}); it is ignored')
 
 
 def _parse_metadata(content: dict[str, dict[str, Any]]) -> BagMetadata:
@@ -196,7 +196,7 @@ def unpack(path: Path, folder: Path, total: int) -> tuple[Path, str]:
 def kind_of(path: Path) -> str:
     """Return the format of a file from its first bytes, or raise BadBag."""
     if path.exists() and not limits.is_file(path):
-        raise BadBag(f'{path}: is not a regular file; give a bag file')
+        raise BadBag(f'{path} is not a regular file; give a bag file')
     with path.open('rb') as file:
         head = file.read(16)
     for magic, kind in MAGIC.items():

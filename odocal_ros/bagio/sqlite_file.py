@@ -73,10 +73,10 @@ class SqliteFile(BagFile):
             for row in self._db.execute(sql):  # noqa: UP028 that would close the cursor
                 yield row
         except sqlite3.Error as error:
-            raise Damaged('damaged pages' if checks_left >= 0 else
+            raise Damaged('invalid pages' if checks_left >= 0 else
                           'its tables contain a cycle') from error
         except (OverflowError, ValueError) as error:
-            raise Damaged('damaged pages') from error
+            raise Damaged('invalid pages') from error
 
     def _read_channels(self) -> None:
         kinds = dict(self._query('SELECT name, type FROM sqlite_master'))     # by name
@@ -111,7 +111,7 @@ class SqliteFile(BagFile):
             self._leaf_pages = LeafPages(self.path)
         except NO_ROW as page_error:
             raise Damaged(f'{error}; {page_error}') from None
-        self.damage = 'cut off' if self._leaf_pages.is_truncated else str(error)
+        self.damage = 'truncated' if self._leaf_pages.is_truncated else str(error)
 
     def _scan(self) -> Iterator[tuple[int, int]]:
         rows: Iterator[tuple[Any, ...]] = (

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.calib.speed_scale import SpeedScale
+from odocal_ros.calib.speed_scale import LONGEST_CELL, MIN_CELLS, SHORTEST_CELL, SpeedScale
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.series import Series
 from odocal_ros.output.plot_style import apply_style, BLUE, GREY, new_figure, RED, save_figure
@@ -88,7 +88,9 @@ def _legs_with_speed_scale(result: Calibration) -> list[tuple[int, SpeedScale]]:
     legs = [(number, leg.evidence.by_speed) for number, leg in enumerate(result.legs, 1)
             if leg.evidence is not None and len(leg.evidence.by_speed.bins)]
     if not legs:
-        raise BadUsage('no leg has enough sections in motion for a scale against speed')
+        raise BadUsage('cannot plot scale against speed: no leg has enough straight sections '
+                       f'in motion (required: {MIN_CELLS}, each of {SHORTEST_CELL:g} to '
+                       f'{LONGEST_CELL:g} s)')
     return legs
 
 

@@ -179,10 +179,10 @@ def _no_common_time_text(recorder: LegRecorder) -> str:
     spans = ', '.join(
         f'{INPUTS[slot].label} {" to ".join(str(np.datetime64(ns, "ns"))[:19] for ns in ends)}'
         for slot, ends in _first_and_last(recorder).items())
-    return (f'the stamps of the topics have no time in common: {spans} (UTC); stamp all sensors '
-            'with one clock (likely causes: a time zone, time since boot, GPS time), use arrival '
-            'times (imu.arrival_time, odometer.arrival_time, gnss.arrival_time), or record them '
-            'together')
+    return (f'the stamps of the topics have no time in common: {spans} (UTC). Likely '
+            'cause: a time zone, time since boot, GPS time, or separate recordings. Stamp all '
+            'sensors with one clock, or use arrival times (imu.arrival_time, '
+            'odometer.arrival_time, gnss.arrival_time)')
 
 
 def _span_in_bag(span: LegSpan, bag: AnyBag, first: int, last: int) -> tuple[int, int]:

@@ -57,7 +57,7 @@ def journal_notes(bag: Path) -> JournalNotes | None:
     if not path.exists():
         return None
     if not is_file(path):
-        raise BadUsage(f'{path}: is not a regular file; remove it to replay the bag')
+        raise BadUsage(f'{path} is not a regular file; remove it to replay the bag')
     from odocal_ros.settings.config_file import read_journal_file
     settings, metadata = read_journal_file(path, JOURNAL_BLOCK)
     topics = {slot: metadata[f'topics.{slot}'] for slot in SLOTS if f'topics.{slot}' in metadata}

@@ -57,7 +57,7 @@ def test_an_mcap_file_without_its_index_is_read_completely(tmp_path, plain, expe
     file_of(path).write_bytes(file_of(path).read_bytes()[:-100])
     found, notes = read(path)
     assert same(found, expected)
-    assert notes == ('drive.mcap is damaged (cut off), but all 1550 messages were read',)
+    assert notes == ('drive.mcap is damaged (truncated), but all 1550 messages were read',)
 
 
 def test_large_rows_of_a_truncated_database_are_read_across_pages(tmp_path):
@@ -166,7 +166,7 @@ def test_a_bag_without_an_undamaged_chunk_is_refused(copied):
         data[at + size // 2] ^= 0xA5
         data[at + 33:at + 37] = b'crc!'
     file_of(path).write_bytes(data)
-    with pytest.raises(BadBag, match=r'cannot be read \(a damaged chunk\); copy it'):
+    with pytest.raises(BadBag, match=r'cannot be read \(invalid chunk\); copy it'):
         read(path)
 
 
@@ -177,7 +177,7 @@ def test_a_checksum_finds_a_changed_value(copied):
     data[at + 33:at + 37] = zlib.crc32(data[packed:at + size]).to_bytes(4, 'little')
     data[packed + (size - 50) // 2] ^= 1
     file_of(path).write_bytes(data)
-    assert 'a damaged chunk' in read(path)[1][0].text      # packed: any change shows
+    assert 'invalid chunk' in read(path)[1][0].text      # packed: any change shows
 
 
 def test_a_database_that_is_being_written_is_refused(tmp_path):
