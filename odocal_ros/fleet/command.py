@@ -70,7 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'leg with the decision on all legs of the vehicle; writes kpi.json')
     add('--files', action='store_true', help='write configuration files for each vehicle '
         '(Autoware, ros2_control, receivers, TF)')
-    add('--quiet', action='store_true', help='print nothing but errors, and the lines of --accept')
+    add('--quiet', action='store_true', help='print only errors, and with limits (--accept) the '
+        'accept/reject line of each vehicle')
     add_calibration_arguments(parser)
 
 

@@ -27,13 +27,13 @@ SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topi
            'imu_orientation': 'the IMU orientation', 'gyrocompass': 'the gyrocompass'}
 # values of the planar estimator
 PLANAR_QUANTITIES = {
-    DIFFERENTIAL: ('the scale', 'left and right wheel', 'the track width (in turns)'),
-    SKID: ('the scale', 'left and right wheel', 'the track width (on the spot)',
-           'the track width arc (on arcs)'),
-    MECANUM: ('the scale', 'the rotation lever (in turns)',
-              'the lateral scale factor (in sideways motion)'),
-    OMNI: ('the scale', 'the rotation lever (in turns)',
-           'the factor of each wheel (in sideways motion)')}
+    DIFFERENTIAL: ('the scale', 'left and right wheel', 'the track width (needs turns)'),
+    SKID: ('the scale', 'left and right wheel', 'the track width (needs turns on the spot)',
+           'the track width arc (needs arcs)'),
+    MECANUM: ('the scale', 'the rotation lever (needs turns)',
+              'the lateral scale factor (needs sideways motion)'),
+    OMNI: ('the scale', 'the rotation lever (needs turns)',
+           'the factor of each wheel (needs sideways motion)')}
 METHOD_WITHOUT_HEADING = 'smoother'   # the method that needs no external heading
 YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
 
@@ -113,7 +113,8 @@ def _wheel_quantities(config: Config) -> list[tuple[bool, str]]:
         return [(False, f'left and right wheel separately (method {config.method} uses their '
                  'mean)')]
     width = config.odometer.track_width
-    return [(True, 'left and right wheel')] + [(True, 'the track width (in turns)')] * (not width)
+    return [(True, 'left and right wheel')] + [
+        (True, 'the track width (needs turns)')] * (not width)
 
 
 def _expected_alignment(config: Config, received: Received) -> Alignment:

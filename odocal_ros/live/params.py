@@ -44,7 +44,7 @@ QOS: dict[str, tuple[str, ...]] = {
     'reliability': ('reliable', 'best_effort', 'system_default', 'best_available'),
     'history': ('keep_last', 'keep_all', 'system_default'), 'depth': ()}
 UNKNOWN_DATE = 'an unknown date'
-FILE_REMEDY = 'use the file that ~/save wrote'
+FILE_REMEDY = 'load the unedited file written by ~/save'
 
 
 def _result_defaults(names: Iterable[str]) -> dict[str, Any]:
@@ -204,7 +204,7 @@ def restored_from(results: dict[str, Any],
     """Return the result in ``result.*``, None without one; raise BadConfig if it is impossible."""
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
-        raise BadConfig(f'result.legs: {legs} is not a number of legs; {FILE_REMEDY}')
+        raise BadConfig(f'result.legs is {legs}; it must be 0 or more; {FILE_REMEDY}')
     if one_line(stamp) != stamp:
         raise BadConfig(f"result.stamp: '{one_line(stamp)}' is not a date; {FILE_REMEDY}")
     found = {}

@@ -258,8 +258,10 @@ class ResultSaver:
         def on_done(folder: Path | None, error: Exception | None) -> None:
             self.saved = '' if folder is None else str(folder)
             if error is not None:
-                self._log.warning('latest still points to a result with a dropped leg: '
-                                  f'{answers.error_line(error)}')
+                self._log.warning(
+                    'could not update `latest` after a leg was dropped; it still points to a '
+                    f'result that includes this leg: {answers.error_line(error)}; the next '
+                    '~/save corrects it')
             self._show()
 
         self._worker.submit(partial(self._folders.withdraw, since_ns), on_done)

@@ -110,8 +110,9 @@ class RunningEstimate:
         """Return a reason for each problem, the worst first; silent_s : since an IMU message."""
         if self._imu_gaps is None:
             return ()
-        cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there; values are those of the '
-                      'better section') for r in self._imu_gaps.reasons(silent_s)]
+        cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there into sections; each value '
+                      'of the forecast is from the section with the smaller sigma')
+               for r in self._imu_gaps.reasons(silent_s)]
         forecast = self._section_forecast
         reasons = (*cut, *self._faults, *(forecast.faults if forecast else ()))
         by_code = {r.code: r for r in reversed(reasons)}

@@ -123,7 +123,8 @@ class Input:
         """Return a warning if the topic has several publishers or IMUs, else an empty text."""
         frames = self.reader.frames if self.reader is not None else None
         if frames is not None and frames.other_frame and not self._configured_frame:
-            return (f'{self.topic} carries several IMUs (frame_id {one_line(frames.frame)!r} and '
+            return (f'{self.topic} contains messages of several IMUs (frame_id '
+                    f'{one_line(frames.frame)!r} and '
                     f'{one_line(frames.other_frame)!r}): set imu.frame_id to the one to use')
         same_type = [p for p in self.publishers if p.topic_type == self.msgtype]
         if len(same_type) < 2:

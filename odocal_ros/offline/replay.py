@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--force', action='store_true', help='replace an existing calibration.json')
     parser.set_defaults(brief=False)      # only ``odocal try`` prints the short form
     add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
-    add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
+    add('--quiet', action='store_true', help='print only errors, and with --accept its line')
 
 
 def add_input_arguments(parser: argparse.ArgumentParser,

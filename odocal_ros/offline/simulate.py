@@ -131,7 +131,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--bags', type=int, default=10, metavar='N', help='bags per vehicle of --fleet, one per '
         'week (default 10)')
     add('--force', action='store_true', help='replace the bag and the files written with it')
-    add('--quiet', action='store_true', help='print nothing but errors')
+    add('--quiet', action='store_true', help='print only errors')
 
 
 def _flag(name: str) -> str:

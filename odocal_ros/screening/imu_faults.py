@@ -140,7 +140,7 @@ def other_frame_reasons(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
     if count < MIXED_SHARE * total:
         return (Reason(Code.BAD_ROWS_DROPPED, f'{count} of {total} IMU messages have another '
                        f'frame_id than {used!r} ({names}); dropped'),)
-    return (Reason(Code.SEVERAL_IMUS, f'the IMU topic carries several IMUs: '
+    return (Reason(Code.SEVERAL_IMUS, f'the IMU topic contains messages of several IMUs: '
                    f'{len(leg.imu.stamp_ns)} messages of {used!r}, {names}; only {used!r} was '
                    'used', f'Set imu.frame_id to the IMU to calibrate (imu.frame_id: {used!r}), '
                    'or publish each IMU on its own topic.'),)
@@ -151,9 +151,9 @@ def alternating_imu_reasons(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
     share = max(_share_of_second_imu(w_i), _share_of_second_imu(f_i))
     if not share:
         return ()
-    return (Reason(Code.SEVERAL_IMUS, 'the IMU topic carries two IMUs: every second message has '
-                   f'other axes or biases ({100 * share:.0f} % of the differences between odd and '
-                   'even messages are constant or in proportion to the signal)',
+    return (Reason(Code.SEVERAL_IMUS, 'the IMU topic contains messages of two IMUs: every second '
+                   f'message has other axes or biases ({100 * share:.0f} % of the differences '
+                   'between odd and even messages are constant or in proportion to the signal)',
                    'Stop the second publisher, or publish each IMU on its own topic.'),)
 
 

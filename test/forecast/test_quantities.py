@@ -205,7 +205,7 @@ def test_remaining_seconds_of_standstill_are_stated():
      'observable: the scale, the yaw (from the gyrocompass, '),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {'two_wheels': True},
      'observable: the scale, the yaw (from the configured heading, 0.11 deg), the pitch, left '
-     'and right wheel and the track width (in turns)'),
+     'and right wheel and the track width (needs turns)'),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002, 'odometer.track_width': 1.6},
      {'two_wheels': True, 'rested_s': 1.0},
      'observable: the scale, the yaw (from the configured heading, 0.11 deg), the pitch and left '

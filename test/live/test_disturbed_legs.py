@@ -19,7 +19,7 @@ from odocal_ros.messages.cdr import FRAME_OFFSET
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 GAP = (100.0, 103.0)       # s of the drive
-WORDS = "carries several IMUs (frame_id 'imu_link' and 'rmu_link'): set imu.frame_id"
+WORDS = "contains messages of several IMUs (frame_id 'imu_link' and 'rmu_link'): set imu.frame_id"
 
 
 @pytest.fixture(scope='module')

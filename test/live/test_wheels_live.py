@@ -148,7 +148,7 @@ def test_the_start_answers_with_the_manoeuvres_and_the_observable_values(session
     assert 'until this hint shows OK for scale and yaw' in text
     assert text.endswith(
         'With these settings, observable: the scale, the yaw (from stops, starts and turns), '
-        'the pitch, left and right wheel and the track width (in turns)')
+        'the pitch, left and right wheel and the track width (needs turns)')
     assert session.first['hint'].split(', ', 1)[1] in text        # the same text in the status
     assert session.first['observable'].startswith('the scale, the yaw (from')
     assert (session.first['not_observable'], session.first['track_width_ok']) == ('', 'unknown')
