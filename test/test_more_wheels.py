@@ -163,7 +163,7 @@ def test_slip_of_one_of_four_wheels_is_reported_and_factors_are_correct():
     spun = np.clip((t - 100.0) / 1.0, 0.0, 1.0) * 1.0 / one.truth.scale       # 1 m
     leg = replace(one.leg(), odometer_right=changed(one.wheels[1], value=lambda a: a + spun))
     result = calibrate(leg, config(one, method='smoother'))
-    assert 'the front_right wheel spins by 1' in codes(result.reasons)[Code.WHEEL_SLIP]
+    assert 'the front_right wheel spins: 1' in codes(result.reasons)[Code.WHEEL_SLIP]
     method = result.methods['smoother']
     for wheel in wheels_of(one.options):
         e = method.estimates[f'scale_factor_{wheel.name}']

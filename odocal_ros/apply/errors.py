@@ -199,3 +199,11 @@ class Errors:
         twist = twist_b @ (self.cov[BG, BG] + AXES * (self.grade.gyro_noise**2 / T)) @ twist_b.T
         self.changed = False
         return np.stack([pose, twist])
+
+
+def force_mismatch_text(residual_n: Floats) -> str:
+    """Return the text for a residual, (3,) m/s^2, that ``Errors.correct_by_gravity`` rejects."""
+    return (f'IMU and odometer disagree: accelerations differ by {np.linalg.norm(residual_n):.3g} '
+            f'm/s^2 (limits: {FAULT_SIGMAS:g} sigma horizontal, {MAX_ACCELERATION:g} m/s^2 '
+            'vertical). Likely cause: slip or a sensor fault. This interval is not used for '
+            'levelling')

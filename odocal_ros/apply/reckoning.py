@@ -31,7 +31,7 @@ from odocal_ros.apply.attitude import (
     ZERO,
 )
 from odocal_ros.apply.delay_search import DelaySearch
-from odocal_ros.apply.errors import BA, BG, DRIVING_FORCE, GRAVITY, PHI
+from odocal_ros.apply.errors import BA, BG, DRIVING_FORCE, force_mismatch_text, GRAVITY, PHI
 from odocal_ros.apply.odometry_start import Start
 from odocal_ros.apply.pose import covariances, pack_pose, Pose, velocity_variances
 from odocal_ros.apply.stream import IMU_GAP_INTERVALS, ImuStream, INTERVAL_ROWS
@@ -249,9 +249,7 @@ class DeadReckoning:
     def _add_mismatch(self, residual_n: Floats, velocity: Floats, T: float, w: Floats) -> None:
         """Report a force that contradicts the odometer; increase the variance of the last T s."""
         self._mismatch_count += 1
-        self._notes.append('specific force and odometer motion differ by '
-                           f'{np.linalg.norm(residual_n):.3g} m/s^2: IMU or odometer is faulty; '
-                           'not used for levelling')
+        self._notes.append(force_mismatch_text(residual_n))
         self.errors.add_turn(np.eye(3) * np.sum((w.mean(axis=0) - self.bias)**2) * T**2)
         self.errors.add_travel(min(float(np.linalg.norm(residual_n[:2])) * T**2 / 2,
                                    float(np.linalg.norm(velocity - self._v_corrected)) * T))

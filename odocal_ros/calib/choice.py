@@ -41,7 +41,8 @@ COMPARED = {
     'scale_factor': ('scale', 'slip or bad fixes at one of the marks'),
     'yaw_mounting_angle': ('yaw', 'an error of the configured heading (alignment.heading_source) '
                            'of about this size'),
-    'pitch_mounting_angle': ('pitch', 'heights at the marks, hills, or an accelerometer bias')}
+    'pitch_mounting_angle': ('pitch', 'wrong heights of the fixes at the marks, a slope, or an '
+                             'accelerometer bias')}
 
 
 def deciding_methods(method_setting: str | tuple[str, ...],
@@ -131,6 +132,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
             text = (format_change(difference / a.value) if name == 'scale_factor' else
                     f'{math.degrees(difference):+z.3f} deg')
             reasons.append(Reason(
-                Code.METHODS_DISAGREE, f'{label}: {second.name} and {first.name} differ by '
-                f'{text}, {abs(difference) / sigma:.1f} sigma; likely cause: {cause}'))
+                Code.METHODS_DISAGREE, f'{label}: {second.name} minus {first.name} is {text} '
+                f'({abs(difference) / sigma:.1f} sigma; limit {REMARK_SIGMAS:g}); likely cause: '
+                f'{cause}'))
     return reasons

@@ -106,7 +106,8 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
     t, fixes = t_fix[rows], fixes_n[rows, :2]
     if len(fixes) < 2:
         return (Reason(Code.NO_FIX, f'{len(fixes)} usable fix{"es" * (len(fixes) != 1)} between '
-                       'the marks; required: 2 or more'),)
+                       'the marks; required: 2 or more. Likely cause: the topic stopped, or the '
+                       'marks are too close'),)
     if len(fixes) > 4:       # a single outlier is no motion: running median of three
         fixes = np.median(np.lib.stride_tricks.sliding_window_view(fixes, 3, axis=0), axis=-1)
         t = t[1:-1]
@@ -115,7 +116,8 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
     fixes_move = np.hypot(*np.ptp(fixes, axis=0)) > max(min_motion, 10 * sigma)
     inside = (travel.t >= 0) & (travel.t <= t_stop)
     if inside.sum() < 2:
-        return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
+        return (Reason(Code.NO_ODOMETER, 'fewer than two odometer messages between the marks. '
+                       'Likely cause: the topic stopped, or the marks are too close'),)
     # three counts: a wheel at rest on the edge of a pulse may count once in each direction
     wheels_move = np.ptp(travel.s[inside]) > 3 * travel.quantum
     if wheels_move and fixes_move:

@@ -105,12 +105,12 @@ def wrong_axis_reasons(inputs: Inputs, located: LocatedFixes,
             return _inverted_turns(orientation, wrong_axes, names)
     if not wrong_axes:
         return ()
-    action = ', '.join(
+    action = '; '.join(
         f'negate angular_velocity.{published}' if published == true[-1] else
-        f'publish angular_velocity.{published} as {true[:-1]}angular_velocity.{true[-1]}'
-        for published, true, _ in wrong_axes)
+        f'publish the value of angular_velocity.{published}{", negated," * (true[0] == "-")} as '
+        f'angular_velocity.{true[-1]}' for published, true, _ in wrong_axes)
     if len(wrong_axes) == 1 and wrong_axes[0].published != wrong_axes[0].true[-1]:
-        action += ', and check the other axes'
+        action += '; then check the other axes'
     return (Reason(Code.GYRO_AXES, '; '.join(axis.text for axis in wrong_axes),
                    f'Correct the IMU driver: {action}. {NO_ROTATION}'),)
 
@@ -241,14 +241,14 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
     if ratio is None or PLAUSIBLE_RATIO[0] < ratio < PLAUSIBLE_RATIO[1]:
         return ()
     if ratio < -PLAUSIBLE_RATIO[0]:
-        return (Reason(Code.GYRO_SIGN, 'turns by the gyro are opposite to those by the fixes '
-                       f'(ratio {ratio:.2f}, expected: 1)'),)
+        return (Reason(Code.GYRO_SIGN, 'turns measured by the gyro are opposite to those of '
+                       f'the fixes (ratio {ratio:.2f}, expected: 1)'),)
     degrees = 40.0 < ratio < 80.0       # 180 / pi, with a margin for scale errors and skid
     if abs(ratio) < 0.01:       # no error of the unit: revolutions give 0.16
-        return (Reason(Code.IMU_UNITS, f'turns by the gyro are only {ratio:#.2g} times those by '
-                       'the fixes', 'Set imu.mounting_rpy if another IMU '
+        return (Reason(Code.IMU_UNITS, f'turns measured by the gyro are only {ratio:#.2g} times '
+                       'those of the fixes (expected: 1)', 'Set imu.mounting_rpy if another IMU '
                        'axis is vertical; otherwise correct the IMU driver.'),)
-    text = (f'turns by the gyro are {ratio:#.3g} times those by the fixes (limits '
+    text = (f'turns measured by the gyro are {ratio:#.3g} times those of the fixes (limits '
             f'{PLAUSIBLE_RATIO[0]:g} and {PLAUSIBLE_RATIO[1]:g})')
     if degrees:
         return (Reason(Code.IMU_UNITS, text + ', typical for deg/s',

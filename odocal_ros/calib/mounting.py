@@ -55,8 +55,9 @@ class Mounting:
         if self.forward_i is not None:
             return (f'the IMU axes are {deviation:.0f} deg from quarter turns (limit '
                     f'{limit:.0f} deg)')
-        by = f' (1 sigma: {sigma:.0f} deg; limit {limit / 2:.0f} deg)' * bool(sigma < 180)
-        return f'this drive does not determine which IMU axis points forward{by}'
+        sigma_text = f' (sigma {sigma:.0f} deg; the limit is {limit / 2:.0f} deg)' * bool(
+            sigma < 180)
+        return f'this drive does not determine which IMU axis points forward{sigma_text}'
 
 
 def remedy(estimate: Mounting) -> str:
@@ -74,8 +75,8 @@ def remedy(estimate: Mounting) -> str:
     by_forward_axis = '; '.join(
         f'{"+" if C[0].sum() > 0 else "-"}{AXES[int(np.argmax(np.abs(C[0])))]}: {_rpy_text(C)}'
         for C in upright)
-    return (f'{cause}. Drive with stops, starts and turns, or set imu.mounting_rpy by this axis '
-            f'({by_forward_axis}).')
+    return (f'{cause}. Drive with stops, starts and turns, or set imu.mounting_rpy for the IMU '
+            f'axis that points forward: {by_forward_axis}.')
 
 
 def _rpy(C_bi: Floats) -> list[float]:

@@ -191,15 +191,15 @@ def travel_error_sign(t: float, duration: float, metres: float, t_speed: Floats,
 def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
     """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m; sign : their error sign."""
     reasons = []
-    for code, tested_sign, relation, circumstance in (
-            (Code.TRAVEL_MISSING, -1, 'less', 'without braking'),
-            (Code.TRAVEL_EXCESS, 1, 'more', 'while it brakes to a stop')):
+    for code, tested_sign, verb, circumstance in (
+            (Code.TRAVEL_MISSING, -1, 'misses', 'without braking'),
+            (Code.TRAVEL_EXCESS, 1, 'adds', 'while the vehicle brakes to a stop')):
         size, times = np.abs(metres[sign == tested_sign]), t[sign == tested_sign]
         several = len(times) > 1
         if len(times):
             reasons.append(Reason(code, (
-                f'the odometer counts {size.sum():.2f} m {relation} than the vehicle moves, at '
-                f'{len(times)} place{"s" * several} {circumstance}, {"the largest " * several}'
+                f'the odometer {verb} {size.sum():.2f} m of travel at {len(times)} '
+                f'place{"s" * several} ({circumstance}); {"largest " * several}'
                 f'at t = {times[np.argmax(size)]:.0f} s')))
     return reasons
 
@@ -277,10 +277,12 @@ def wheel_slip_reason(slips: WheelSlips, names: tuple[str, ...]) -> tuple[Reason
     size, begin = slips.size[worst], slips.begin[worst]
     duration = max(slips.end[worst] - begin, SLIP_GRID)
     if slips.wheel[worst] == 0:
-        event = 'one of the wheels deviates from the other'
+        event = (f'one of the wheels slips: {100 * abs(size):.0f} cm between them that the gyro '
+                 'does not measure')
     else:
         event = (f'the {names[int(slips.wheel[worst] > 0)]} wheel '
-                 f'{"spins" if size > 0 else "slides"}')
+                 f'{"spins" if size > 0 else "slides"}: {100 * abs(size):.0f} cm '
+                 f'{"more" if size > 0 else "less"} than gyro and other wheel give')
     others = f'; {n} such places, {np.abs(slips.size).sum():.2f} m in total' if n > 1 else ''
-    return (Reason(Code.WHEEL_SLIP, f'{event} by {100 * abs(size):.0f} cm relative to the gyro, '
-                   f'from t = {begin:.1f} s for {duration:.1f} s{others}'),)
+    return (Reason(Code.WHEEL_SLIP, f'{event}, from t = {begin:.1f} s for {duration:.1f} '
+                   f's{others}'),)

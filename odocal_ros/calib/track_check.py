@@ -188,10 +188,10 @@ def worse_check_reasons(path: Floats, before: Floats, after: Floats,
         # fewer than three sections end to end have no known scatter; a tenth more is acceptable
         if count >= 3 and now.mean() >= 1.1**2 * was.mean() \
                 and increase.mean() >= REMARK_SIGMAS * increase.std() / np.sqrt(count):
-            track = 'track as configured' if configured else 'uncalibrated track'
-            return [Reason(Code.CHECK_WORSE, f'in sections of {length:g} m the calibrated track '
-                           f'deviates {np.sqrt(now.mean()):.2g} m rms from the fixes, the {track} '
-                           f'{np.sqrt(was.mean()):.2g} m')]
+            before_text = 'with the configured values' if configured else 'without calibration'
+            return [Reason(Code.CHECK_WORSE, 'calibration makes the track worse: '
+                           f'{np.sqrt(now.mean()):.2g} m rms from the fixes in sections of '
+                           f'{length:g} m, {np.sqrt(was.mean()):.2g} m {before_text}')]
     return []
 
 

@@ -158,8 +158,8 @@ def _disagreement_reasons(joint: JointEstimate, numbers: list[int]) -> tuple[Rea
         if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
             continue
         # two legs have the same deviation from each other
-        who = f'; {_leg_name(numbers[k])} differs most ({z[k]:+z.1f} sigma from the others)' * (
-            J > 2)
+        who = (f'; {_leg_name(numbers[k])} differs most: {z[k]:+z.1f} sigma from the value of '
+               'all legs') * (J > 2)
         reasons.append(Reason(
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
             f'times their uncertainties{who}', DELAY_REMEDY if 'delay' in name else ''))

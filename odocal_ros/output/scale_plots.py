@@ -51,7 +51,7 @@ def draw_by_speed(ax: Any, scale: SpeedScale) -> None:
         ax.plot(3.6 * v, fit, '-', color=style.RED, linewidth=1.2, label='fit')
         ax.axhline(scale.factor[0], color=style.GREY, linewidth=0.8, linestyle='--',
                    label='factor')
-    ax.set(xlabel='speed, km/h', ylabel='path by fixes / odometer')
+    ax.set(xlabel='speed, km/h', ylabel='path from fixes / odometer')
     ax.ticklabel_format(axis='y', useOffset=False)
 
 

@@ -98,9 +98,10 @@ def test_rejected_method_is_named_if_a_later_method_gives_the_value():
 
 
 @pytest.mark.parametrize(('other', 'text', 'cause'), [
-    ({'scale': 2.0 + 1.01 * LIMIT}, 'scale: two_point and smoother differ by +0.214 %, 3.0 sigma',
+    ({'scale': 2.0 + 1.01 * LIMIT}, 'scale: two_point minus smoother is +0.214 % (3.0 sigma; '
+     'limit 3)',
      'marks'),
-    ({'scale': 1.9}, 'by -5 %, ', 'marks'), ({'yaw': 0.01 + 5e-3}, '+0.286 deg', 'heading'),
+    ({'scale': 1.9}, 'is -5 % (', 'marks'), ({'yaw': 0.01 + 5e-3}, '+0.286 deg', 'heading'),
     ({'scale': 2.0 + 0.99 * LIMIT}, None, ''), ({'scale': 3.0, 'reasons': [REFUSED]}, None, '')])
 def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause(other, text, cause):
     found = choice.disagreements(several(method('smoother'), method('two_point', **other)))

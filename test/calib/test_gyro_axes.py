@@ -27,10 +27,10 @@ AXES = {'mirrored x': np.diag([-1.0, 1.0, 1.0]), 'mirrored y': np.diag([1.0, -1.
         'x and y swapped': np.eye(3)[[1, 0, 2]], 'x and z swapped': np.eye(3)[[2, 1, 0]],
         'y and z swapped': np.eye(3)[[0, 2, 1]]}
 DO = {'mirrored x': 'negate angular_velocity.x', 'mirrored y': 'negate angular_velocity.y',
-      'x and y swapped': 'publish angular_velocity.x as angular_velocity.y, publish '
-      'angular_velocity.y as angular_velocity.x',
-      'x and z swapped': 'publish angular_velocity.x as angular_velocity.z',
-      'y and z swapped': 'publish angular_velocity.y as angular_velocity.z'}
+      'x and y swapped': 'publish the value of angular_velocity.x as angular_velocity.y; publish '
+      'the value of angular_velocity.y as angular_velocity.x',
+      'x and z swapped': 'publish the value of angular_velocity.x as angular_velocity.z',
+      'y and z swapped': 'publish the value of angular_velocity.y as angular_velocity.z'}
 DEG = np.pi / 180
 
 

@@ -135,7 +135,7 @@ def test_dispute_names_leg_and_parameter(legs):
                          [0, 1, 2], config, [4, 7, 9])
     (text,) = disputes(whole)
     assert text.startswith('yaw_mounting_angle: the scatter of 3 legs')
-    assert '; leg 7 differs most (+' in text
+    assert '; leg 7 differs most: +' in text
     assert whole.estimates[YAW].sigma > 0.002
     # undisputed values keep their sigma
     assert whole.estimates[SCALE].sigma == pytest.approx(

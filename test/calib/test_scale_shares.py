@@ -59,9 +59,8 @@ def test_correction_that_increases_the_error_is_reported():
     (reason,) = worse_check_reasons(PATH, wrong() + noise, wrong(1.02) + noise, configured=True)
     assert reason.code is Code.CHECK_WORSE
     # 2 % of the chord of 100 m and the noise of both ends, each axis
-    assert (f'in sections of 100 m the calibrated track deviates {np.hypot(2.0, 1.0):.2g} '
-            'm') in reason.text
-    assert 'as configured 1 m' in reason.text
+    assert f': {np.hypot(2.0, 1.0):.2g} m rms from the fixes in sections of 100 m' in reason.text
+    assert ', 1 m with the configured values' in reason.text
     assert worse_check_reasons(PATH, wrong(1.02) + noise, wrong() + noise, configured=True) == []
     assert worse_check_reasons(PATH, wrong() + noise, wrong(1.0005) + noise, configured=True) == []
 

@@ -173,7 +173,7 @@ def test_held_speed_before_stops_is_not_slip():
     config = settings(drive, None)
     method = smooth(leg_of(leg, config), config)
     assert not reason_text(method)
-    assert 'while it brakes to a stop' in reason_text(method, Code.TRAVEL_EXCESS)
+    assert 'while the vehicle brakes to a stop' in reason_text(method, Code.TRAVEL_EXCESS)
     assert off(method, drive) < 3.3
 
 

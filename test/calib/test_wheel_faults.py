@@ -111,7 +111,7 @@ def test_slip_of_one_wheel_is_named_with_place_and_size(side, size):
     options = STRAIGHT | {'seed': 8}
     (reason,), slips = faults(options, **{side: spun(options, 120.0, 1.5, size)})
     assert reason.code is Code.WHEEL_SLIP
-    assert reason.text.startswith(f'the {side} wheel {"spins" if size > 0 else "slides"} by')
+    assert reason.text.startswith(f'the {side} wheel {"spins" if size > 0 else "slides"}: ')
     assert slips.wheel.tolist() == [1 if side == 'right' else -1]
     # the mean over ten rounded rows at each end of each wheel, 5 sigma, and the count that
     # rounding removes from the spin
@@ -137,7 +137,7 @@ def test_long_slip_is_found_whole_and_names_a_wheel_only_with_evidence(length, c
     options = TOWN | {'seed': 3}
     (reason,), slips = faults(options, left=spun(options, 100.0, length, 0.5 * length))
     assert reason.text.startswith('the left wheel spins' if certain else
-                                  'one of the wheels deviates')
+                                  'one of the wheels slips: ')
     # scrub in turns may be 1 % of the track width times the turn of 90 deg: 3 cm
     assert_place(slips, 100.0, length, 0.5 * length, 0.2 * length, 0.1)
 
@@ -214,7 +214,7 @@ def test_gyro_without_turns_does_not_determine_the_factors():
     result = calibrate(leg, settings(made, method='smoother'))
     assert result.methods == {}
     reason = next(r for r in result.reasons if r.code is Code.IMU_UNITS)
-    assert 'turns by the gyro are only' in reason.text
+    assert 'turns measured by the gyro are only' in reason.text
     assert 'gyro_scale' not in reason.special_remedy
 
 

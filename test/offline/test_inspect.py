@@ -87,7 +87,7 @@ def test_a_counter_that_counts_down_does_not_turn_the_imu(inspect_drive, rpy):
     ({'accel': 1 / 9.80665}, 'IMU_UNITS', 'specific force is not in m/s^2 but in g'),
     ({'accel': 1 / 9.80665}, 'IMU_UNITS', '--set imu.accel_scale=9.80665'),
     ({'gyro': 180 / math.pi}, 'IMU_UNITS', f'--set imu.gyro_scale={math.pi / 180!r}'),
-    ({'gyro': 2.0}, 'IMU_UNITS', 'IMU_UNITS: turns by the gyro are 2.'),
+    ({'gyro': 2.0}, 'IMU_UNITS', 'IMU_UNITS: turns measured by the gyro are 2.'),
     ({'gyro': -1.0}, 'GYRO_SIGN', 'GYRO_SIGN'), ({'accel': -1.0}, 'GYRO_SIGN', 'GYRO_SIGN')])
 def test_wrong_units_and_signs_are_found(inspect_drive, capsys, wrong, code, remedy_text):
     seen, text = inspect_drive(drive(**wrong))

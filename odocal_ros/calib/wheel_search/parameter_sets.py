@@ -184,7 +184,8 @@ def search_ranges(wheels: WheelsConfig, heading_sigma: float | None = None) -> R
         scale, scale_source = wheels.radius_range, 'wheels.radius_range'
     else:
         default_scale = 0.05
-        scale, scale_source = default_scale, 'no error of the wheels is stated: 5 %'
+        scale, scale_source = default_scale, (
+            'no wheel error is configured (wheels.radius_range): 5 % assumed')
     if wheels.heading_range > 0:
         heading, heading_source = wheels.heading_range, 'wheels.heading_range'
     elif heading_sigma:
@@ -192,8 +193,8 @@ def search_ranges(wheels: WheelsConfig, heading_sigma: float | None = None) -> R
     else:
         default_heading = np.deg2rad(10.0)
         heading, heading_source = default_heading, (
-            'heading and mounting angle rotate the track in the same way, and no error of them is '
-            'stated: 10 deg')
+            'no heading error is configured (wheels.heading_range): 10 deg assumed for heading '
+            'and mounting angle together')
     # an odd number has zero among its levels
     n = wheels.levels if wheels.levels < 3 else next_prime_power(wheels.levels, odd=True)
     return Ranges(np.array([scale, scale, heading]),

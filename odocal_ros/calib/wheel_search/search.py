@@ -118,7 +118,7 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
     free = direct = least_squares(leg, x[best], Space(ratio_is_fixed=False), robust)
     # half ranges are 2 sigma: the ratio is fixed if the fixes do not reduce its sigma
-    ratio_is_fixed = not free.sigma_difference <= float(np.hypot(*ranges.half_range[:2])) / 2
+    ratio_is_fixed = not free.sigma_difference <= difference_limit(ranges)
     space = Space(ratio_is_fixed)
     if ratio_is_fixed:
         direct = least_squares(leg, x[best], space, robust)
@@ -130,6 +130,11 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
         ratio_is_fixed, refined, direct, free, refined_set, direct_set,
         score(leg, leg.start, robust), score(leg, refined_set, robust),
         _reasons(ranges, refined, direct, free, ratio_is_fixed))
+
+
+def difference_limit(ranges: Ranges) -> float:
+    """Return the largest relative sigma of right minus left with which they are separate."""
+    return float(np.hypot(*ranges.half_range[:2])) / 2
 
 
 def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
@@ -152,12 +157,12 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
     reasons = []
     if ratio_is_fixed:
         sigma = 100 * free.sigma_difference
-        text = (f'determine the difference of the wheels only to {sigma:.2g} %' if sigma < 100 else
-                'do not separate left and right wheel')
-        reasons.append(Reason(Code.WHEELS_NOT_SEPARABLE, f'positions {text} (condition number '
-                              f'{free.condition:.2g}, correlation '
-                              f'{free.correlation[0, 1]:+z.6f}): the search changed both factors '
-                              'together'))
+        text = f'{sigma:.2g} %' if sigma < 100 else '100 % or more'
+        reasons.append(Reason(
+            Code.WHEELS_NOT_SEPARABLE, 'left and right scale cannot be separated: the sigma of '
+            f'their difference is {text} (limit {100 * difference_limit(ranges):.2g} %; condition '
+            f'number {free.condition:.2g}, correlation {free.correlation[0, 1]:+z.6f}). The '
+            'search changed both together'))
     if refined.widened:
         changes = [f'{name} ± {_amount(name, before)} to ± {_amount(name, after)}'
                    for name, before, after in zip(

@@ -151,8 +151,8 @@ def not_observable_reason(drives: str, names: list[str], local: bool) -> Reason:
     heights = all(name.endswith('_z') for name in names)
     return Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on {drives}: '
                   f'{name_antenna(join_names(names), local)}; the configured values are used',
-                  'Measure these heights and set them: turns, stops and starts hardly determine '
-                  'them.' if heights else '')
+                  'Measure these heights and set them. Even a drive with turns and stops hardly '
+                  'determines them.' if heights else '')
 
 
 def join_names(names: Iterable[str]) -> str:
