@@ -26,7 +26,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_yaw
 
-TRIAL_PASSES = 3    # judgement: of each of two starts, before the more likely one continues
+TRIAL_PASSES = 3    # judgement: passes from each start, before the more likely one continues
 # initial size (S28) of the scale error of an odometer inside the receiver, and shortest leg, s,
 # that starts with it: ten times the time constant with which satellites correct that odometer;
 # shorter legs do not determine its error. Tuned on six drives of 300 s in yards with an error of

@@ -17,7 +17,7 @@ FARTHEST_LIMIT_M = 2e4    # judgement: longest remaining distance of a useful fo
 UNREACHABLE = f'the limit is not reached within another {FARTHEST_LIMIT_M / 1000:.0f} km'
 # judgement: standstill at a predicted end; it gives the level and the gyro bias
 PREDICTED_REST_S = 10.0
-SOURCE_SHARE = 0.01    # judgement: of the variance; smaller sources are not listed
+SOURCE_SHARE = 0.01    # judgement: share of the variance; smaller sources are not listed
 # estimates in ~/status, and the unit at the end of their keys
 RUNNING_UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
 

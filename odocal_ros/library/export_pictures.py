@@ -17,7 +17,7 @@ from odocal_ros.library.series import Series
 from odocal_ros.output.plot_style import apply_style, BLUE, GREY, new_figure, RED, save_figure
 from odocal_ros.output.program_files import features
 
-MAX_POINTS = 400     # judgement: of a line or of the fixes, for a small file
+MAX_POINTS = 400     # judgement: points of a line, or fixes, for a small file
 NOT_ON_A_MAP = ('the positions are in a local frame, which has no place on a map; use '
                 'trajectory.csv or trajectory.tum')
 # estimates of SpeedScale and their units in the names of columns

@@ -35,7 +35,7 @@ from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config
 
 JOURNAL_BLOCK = 'odocal_journal'     # name of the metadata in the settings file of a journal
-STILL_SHARE = 0.05      # judgement: of the largest travel in a second; above it the robot moves
+STILL_SHARE = 0.05      # judgement: over the largest travel in a second; if above, the robot moves
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ class AutomaticLegs(LegCompletion):
                            f'{iso(stored.carried.last_ns)}')
 
     def _control_automatic_leg(self, search: LegSearch) -> None:
-        """Start or end a leg if the search has found its begin or its end."""
+        """Start or end a leg if the search has found its start or its end."""
         session, span, newest = self.session, search.spans[0], search.spans[-1]
         if session.state is not State.RECORDING and newest.start_ns != self._progress_start_ns:
             self._progress_start_ns = newest.start_ns      # the leg before may still be computed

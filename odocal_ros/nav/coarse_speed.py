@@ -27,7 +27,7 @@ from odocal_ros.nav.time_series import MISSING_INTERVALS
 
 MIN_EDGE_SIGMA = 0.02      # judgement: in steps, minimum sigma of a speed at an edge
 MIN_SPAN_STEPS = 3.0          # judgement: steps that the values must span
-MIN_COHERENCE = 0.9     # judgement: of the distinct values at the frequency 1 / step, 1: multiples
+MIN_COHERENCE = 0.9     # judgement: coherence of distinct values at 1 / step; 1: all are multiples
 # judgement: bins of the values' span; FFT size with zero padding; FFT size of the quick test
 VALUE_BINS, FFT_SIZE, QUICK_FFT_SIZE = 2**17, 2**20, 2**18
 MIN_NUMBER = 1e-300      # format: floats below it are integers of a wrong type; 1 / x overflows

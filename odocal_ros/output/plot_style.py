@@ -21,8 +21,8 @@ from odocal_ros.safe_io.atomic_files import whole_file
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
 Drawing = tuple[str, str, str]      # title, description, SVG
-MAX_POINTS = 1200   # judgement: of a line
-MAX_MARKS = 400     # judgement: of single marks
+MAX_POINTS = 1200   # judgement: points of a line
+MAX_MARKS = 400     # judgement: number of single marks
 STYLE: dict[Any, Any] = {
     'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
     'font.size': 9.0, 'axes.labelsize': 9.0, 'legend.fontsize': 8.5, 'axes.axisbelow': True,

@@ -19,7 +19,7 @@ from odocal_ros.safe_io.text_formats import date_text
 from odocal_ros.settings.config import Config
 
 NAME = 'report.html'
-MAX_BYTES = 2_600_000     # judgement: of figures; a page stays under 3 MB with its tables
+MAX_BYTES = 2_600_000     # judgement: size of all figures; with tables, a page has less than 3 MB
 TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Warnings',
           Verdict.ACCEPTED: 'Notes'}
 

@@ -13,8 +13,8 @@ from typing import Any
 from odocal_ros.errors import BadBag
 
 FACTOR_VARIABLE = 'ODOCAL_LIMITS'
-DEFINITION_CHARACTERS = 2**16     # judgement: of a message definition
-MESSAGE_BYTES = 2**26             # judgement: of one requested message
+DEFINITION_CHARACTERS = 2**16     # judgement: length of a message definition
+MESSAGE_BYTES = 2**26             # judgement: size of one requested message
 MESSAGE_VALUES = 100_000          # judgement: in the fixed arrays of one message
 PARSE_SECONDS = 20                # judgement: to parse a message definition
 # judgement: bytes first given to a decompressor: it copies the rest of its input after each

@@ -39,7 +39,7 @@ MAX_CLOCK_OFFSET = 1.0     # s, larger ones are no delay. Format: range of a tim
 # judgement: least step of a clock that is detected, s; rows before and after it whose median lag
 # gives its size
 CLOCK_STEP, STEP_LAG_ROWS = 0.01, 50
-OFFSET_CELL = 0.25          # s, judgement: of means; an acceleration of the vehicle takes longer
+OFFSET_CELL = 0.25          # s, judgement: time of a mean; accelerations of a vehicle take longer
 FARTHEST_OFFSET = 90.0      # s, judgement: largest offset that is found
 # s, judgement: slower changes of force (slopes) and of speed (traffic) are removed
 SLOW_FORCE, SLOW_SPEED = 20.0, 60.0

@@ -17,9 +17,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import CHUNK_ROWS, chunks, Floats, Ints, runs, work_array
 
-BLOCK_TIME = 1.0          # s, judgement: of rows whose mean time shows a lost row
+BLOCK_TIME = 1.0          # s, judgement: duration of rows whose mean time shows a lost row
 WINDOW_BLOCKS = 20        # judgement: blocks of a mean; at 100 Hz jitter / sqrt(2000) remains
-JITTER_SHARE = 2e-3       # judgement: of an interval, smallest jitter that is corrected
+JITTER_SHARE = 2e-3       # judgement: smallest jitter that is corrected, over the interval
 TESTED_ROWS = 20_000      # judgement: largest number of tested rows
 TESTED_GROUPS = 40        # judgement: groups of them, whose sums give the significance
 # definition: a row and the two before and after it, whose cubic predicts its values

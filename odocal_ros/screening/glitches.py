@@ -206,7 +206,7 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
     frozen = np.flatnonzero((end - begin > limit)
                             & (rolled > ROLLING_SHARE * np.percentile(speed, 95)))
     frozen_rows = np.diff(repeats[frozen]).sum()
-    coarse_share = 0.2      # judgement: of the other rows; fine gyros have no repeats
+    coarse_share = 0.2      # judgement: share of the other rows; fine gyros have no repeats
     if not len(frozen) or same.sum() - frozen_rows > coarse_share * (len(same) - frozen_rows):
         return ()
     worst = frozen[np.argmax((end - begin)[frozen])]

@@ -30,11 +30,11 @@ GRAVITY_RATIO = 1.15
 LARGEST_YAW_TURN = 135.0
 YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond MIN_IMU_TURN
 REMEDY = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
-TENTHS, MIN_TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
+TENTHS, MIN_TENTH_ROWS = 10, 20       # judgement: sections of a leg; least rows of one
 # judgement: limits of measured gravity over the Earth's. Units and ranges differ by a factor of 2
 # at least; in a continuous bend at 1.2 g the force is 1.56 times gravity
 MIN_RATIO, MAX_RATIO = 0.6, 1.6
-MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
+MIXED_SHARE = 0.01     # judgement: share of all messages; fewer are damaged, not a second IMU
 # judgement, for the test of alternating rows: rows of a block; least and largest number of blocks,
 # from the end of the leg; ratio of an outlier to the median; largest share of repeated rows
 MEAN_ROWS, MIN_MEANS, MAX_MEANS, OUTLIER_RATIO, REPEATED_SHARE = 50, 40, 2000, 10.0, 0.2

@@ -27,7 +27,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import G
 
-MIN_GRAVITY = 0.5  # judgement: of 9.8 m/s^2, or of 1 g; a smaller median is motion only
+MIN_GRAVITY = 0.5  # judgement: relative to 9.8 m/s^2 or 1 g; a smaller median is motion only
 GRAVITY_ROWS = 20_000  # judgement: largest number of rows in the median
 TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
 

@@ -21,7 +21,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS
 from odocal_ros.settings.nominal import G
 
-REVERSING_STEP = 0.1        # s, judgement: of the time grid
+REVERSING_STEP = 0.1        # s, judgement: step of the time grid
 ACCELERATION_TIME = 0.6     # s, judgement: half the length of the second differences of travel
 STOP_TIME = 1.0             # s, judgement: used before a start, at standstill
 BY_IMU = 'the acceleration has the opposite sign of the other starts'

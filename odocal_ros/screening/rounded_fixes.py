@@ -14,7 +14,7 @@ FINEST_ANGLE = 1e-10    # rad, physical: 0.6 mm: finer steps have no effect
 # statistical: least number of differences; those of unrounded values are all multiples of one
 # step once in 10^9
 MIN_DIFFERENCES = 10
-OFF_GRID = 0.02         # judgement: of a step, limit of the deviation of a multiple
+OFF_GRID = 0.02         # judgement: limit of the deviation from a multiple of a step, in steps
 
 
 def rounding_variance(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, tuple[Reason, ...]]:

@@ -189,7 +189,7 @@ def _separate_equal_stamps(samples: Any) -> Any:
 
 def _spread_packets(imu: Any) -> tuple[Any, list[Reason]]:
     """Return IMU samples, packets of equal stamps spread over the time since the last packet."""
-    stamp, min_share = imu.stamp_ns, 1 / 3       # judgement: of all; fewer are duplicates
+    stamp, min_share = imu.stamp_ns, 1 / 3       # judgement: share of rows; fewer: duplicates
     step = np.diff(stamp)
     same = step == 0
     if same.sum() <= min_share * len(stamp) or (step < 0).any():

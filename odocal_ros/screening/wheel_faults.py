@@ -26,7 +26,7 @@ Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
 # robust sigmas beyond which a row has no weight; statistical: 95 % efficient on normal errors
 TUKEY = 4.685
 FAULT_CELL = 0.5          # s, judgement: duration of a cell
-STALLED_SHARE = 0.02      # judgement: of the other wheel's travel; a stalled wheel travels less
+STALLED_SHARE = 0.02      # judgement: share of the other wheel's travel; a stalled wheel has less
 OTHER_WHEEL_COUNTS = 8    # judgement: least counts of the other wheel during a stall
 SENT_TWICE_REMEDY = ('Check odometer.left and odometer.right, and in the driver that each wheel '
                      'has its own counter.')

@@ -21,7 +21,7 @@ from odocal_ros.sim.vehicle_distributions import G
 FREQUENCY = 2 * np.pi * 1.3   # rad/s
 DAMPING = 0.3
 STILL = 1e-9          # m/s, judgement: rounding
-KNEELING_TIME = 2.0   # s, judgement: of the kneeling or rising of a bus
+KNEELING_TIME = 2.0   # s, judgement: time in which a bus kneels or rises
 
 
 def tilts(speed: Profile, yaw_rate: Profile, real: RealEffects, hills: Hills | None = None,

@@ -12,7 +12,7 @@ from odocal_ros.settings.levels import DAY_NS
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.scenarios import Drive, SimOptions
 
-WALK = 1e-4              # judgement: of the scale, relative, per square root of a day
+WALK = 1e-4              # judgement: random walk of the scale, relative, per square root of a day
 # judgement: shares of the vehicles whose tyres are changed, IMU moved, counter broken; at least
 # one of three
 CHANGE_SHARES = {'scale_factor': 0.1, 'yaw_mounting_angle': 0.05, 'counter': 1 / 30}

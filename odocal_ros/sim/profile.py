@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from odocal_ros.data.arrays import Floats, Ints
 
 Piece = tuple[float, tuple[float, float, float, float]]    # duration, powers of time in it
-KERB_LENGTH = 0.5    # m, judgement: in which a wheel of a robot climbs a kerb
+KERB_LENGTH = 0.5    # m, judgement: path in which a wheel of a robot climbs a kerb
 
 
 class Profile:

@@ -22,7 +22,7 @@ class BodyTilt:
     """
     The tilt of the body in the K intervals between N keyframes.
 
-    rate_n : (K, 3) rad/s, mean turn rates.   level_left : (K, 3) level axes to the left, at begin.
+    rate_n : (K, 3) rad/s, mean turn rates.   level_left : (K, 3) level axes to the left, at start.
     pitch_increments : (K, 4) rad, nose down: about ``level_left``; that of the body alone; by
         turns on banked ground; and the turn about up.
     displacements : (K, 3, 6) m in n, of the odometer by a unit of each of BODY_TILT.

@@ -29,7 +29,7 @@ SCALE_HEIGHT = 8435.0
 # pressure coefficient of 0.3; air temperature, relative, 15 K
 PRIOR_SIGMAS = 1e4, 8.4 / 3600, 0.015, 0.05
 EARTH_RADIUS = 6.371e6      # m, physical: mean radius
-HEIGHT_SIGMA = 0.15     # m, physical: of one sample, if a sensor states none
+HEIGHT_SIGMA = 0.15     # m, physical: noise of a sample, if the sensor states none
 MIN_HEIGHT_NOISE = 0.02    # m, physical: the best sensors of today
 RATE = 1.0              # Hz, judgement: of means; heights of a vehicle change more slowly
 

@@ -38,7 +38,7 @@ MIN_ACCEL_OUTLIER, ACCEL_OUTLIER_SHARE, MIN_ACCEL_OUTLIERS = 0.01, 0.01, 3
 MIN_QUANTISATION = 1e-5    # rad/s and m/s^2, physical: finer steps have no effect
 QUANTISATION_SAMPLES = 20_000    # judgement: samples in which a quantisation step is sought
 SAMPLES_PER_VALUE = 20  # judgement: a signal with more samples for each value is quantised
-MIN_EXPLAINED_SHARE = 0.4  # judgement: of the noise variance, if quantisation is its cause
+MIN_EXPLAINED_SHARE = 0.4  # judgement: share of the noise variance if quantisation causes it
 # judgement: limit of the noise of single samples in motion over that at rest. Real drives:
 # vibrating accelerometers 26 and 3.6, gyros 1.3 and 2.0
 MAX_MOTION_RATIO = 3.0
