@@ -177,6 +177,17 @@ def test_imu_worse_than_its_grade_is_reported():
     assert off(method, drive, *BOTH) < 3.3
 
 
+@pytest.mark.parametrize('ratio', [1.0, 1.3, 2.0, 0.5])
+def test_positions_of_another_scale_are_a_mismatch(ratio):
+    """The accelerometer knows the scale of the track, but not why the fixes differ."""
+    _, config, leg = made(duration=300.0, imu_grade='industrial')
+    method = smooth(replace(leg, fixes_n=ratio * leg.fixes_n), config)
+    found = re.search('the fixes are ([^ ]+) times as far apart',
+                      reason_texts(method).get(Code.MODEL_MISMATCH, ''))
+    assert bool(found) == (ratio != 1.0)
+    assert not found or float(found[1]) == pytest.approx(ratio, rel=0.05)
+
+
 def test_last_step_of_an_unconverged_fit_widens_the_sigma():
     _, config, leg = made(**SHORT)
     problem = make_problem(leg, config)

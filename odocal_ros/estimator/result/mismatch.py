@@ -23,7 +23,7 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.imu import sample_noise, sensor_noise
 from odocal_ros.estimator.leg import ExternalSamples, SmootherLeg
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.residuals import SLIP_VARIANCE
+from odocal_ros.estimator.result.residuals import fix_distance_text, SLIP_VARIANCE
 from odocal_ros.estimator.state import HEADING
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -55,6 +55,7 @@ REMEDIES = {
     'sideslip': 'Check odometer.lever_arm. Wheels that slide in turns also look like this: then '
                 'drive wider turns.',
     'heights': 'Check the unit of heights in the fix driver.',
+    'distances': 'Check unit and scale of the positions, such as of a map or a single camera.',
     'heading_fixed': (
         "Check alignment.heading: it is the heading of the IMU's x axis, clockwise from true "
         'north.'),
@@ -155,6 +156,8 @@ def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> dict[st
     if sideslip > SIDESLIP_LIMIT:
         texts[f'sideslip at the odometer is {sideslip:.2f} m/√s (limit '
               f'{SIDESLIP_LIMIT:g})'] = REMEDIES['sideslip']
+    if text := fix_distance_text(problem, fit):
+        texts[text] = REMEDIES['distances']
     # m, judgement: receivers err by up to 10 m; with heights in cm slopes of 0.5 % make it 80 m
     limit = max(50.0, 4 * problem.height_sigma)
     if level['slow_up'] > limit:
