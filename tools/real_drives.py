@@ -114,7 +114,7 @@ def gallery(data: Path, pictures: Path) -> str:
             for shape in shapes['features']:
                 shape['geometry']['coordinates'] = _few(shape['geometry']['coordinates'])
             save_figure(map_figure(shapes['features']), pictures / f'{folder.name}.svg')
-        text = said.getvalue().partition('\n  leg  start')[0].strip()
+        text = said.getvalue().partition('\n\n  track against')[0].strip()
         page += (f'\n## {folder.name}\n\n![Track and fixes](pictures/{folder.name}.svg)\n\n'
                  f'```text\n{text}\n```\n')
     return page
