@@ -7,8 +7,7 @@ Dead reckoning with a calibration, sample by sample, corrected by gravity and at
 From one IMU sample to the next, the attitude is rotated by the increment of ``apply/attitude.py``;
 travel is integrated by the trapezoid rule along the calibrated forward axis, as in
 ``nav/dead_reckoning.py``. Without ``levelling``, equal samples, start attitude and bias give the
-path of a replay. With it, the accelerometer corrects the tilt, and standstills correct the gyro
-bias. The position never jumps.
+path of a replay. With it, the accelerometer corrects the tilt, standstills the gyro bias.
 """
 
 from collections.abc import Sequence
@@ -42,15 +41,14 @@ from odocal_ros.nav.standstill import REST_TURN
 from odocal_ros.settings.levels import FASTEST
 from odocal_ros.settings.node_configs import ApplyConfig
 
-# judgement, all in s: between corrections; averaging time of a speed; odometer silence after which
+# judgement, s: between corrections; averaging time of a speed; silence of the odometer after which
 # only the attitude continues; longest IMU gap in which the force is used
 CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, FORCE_GAP = 1.0, 0.2, 10.0, 0.1
 # judgement: number of consecutive mismatches of force and motion after which the attitude is
 # invalid, if the size of the force differs from gravity by less than this, m/s^2
 MAX_MISMATCHES, GRAVITY_TOLERANCE = 10, 1.0
 ROWS_BEHIND = 200         # judgement: IMU rows, older ones are dropped
-# judgement: relative change of the interval of poses: their covariances are computed again
-PERIOD_CHANGE = 0.1
+PERIOD_CHANGE = 0.1     # judgement: relative change of the interval: covariances are recomputed
 PLAUSIBLE = np.zeros(3)   # rad: value of ``_implausible_turn`` if there is none
 GRAVITY_N = np.array([0.0, 0.0, GRAVITY])
 TILT_LOST = 0.5           # rad; judgement: larger sigmas are beyond a linearised correction

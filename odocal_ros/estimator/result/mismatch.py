@@ -93,11 +93,8 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
 
 def _noise_over_grade(problem: Problem, level: dict[str, float],
                       config: Config) -> tuple[float, list[str], str]:
-    """
-    Return the largest ratio of IMU noise to the grade that the fit uses.
-
-    Also texts on noises above the configured grade, and cause and action, '' without any.
-    """
+    """Return the largest ratio of IMU noise to the grade in use, texts, and the remedy or ''."""
+    # the texts are on noises above the configured grade
     configured, used = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     # no reasons about an accelerometer that does not exist
     sensors = _sensors(problem)
