@@ -17,15 +17,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.data.arrays import blocks, Floats, Ints, work_array
+from odocal_ros.data.arrays import blocks, Floats, Ints, runs, work_array
 from odocal_ros.estimator.chain import Solved
 from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator.factors.factor import IMU
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.state import LN_K, PITCH, YAW
+from odocal_ros.estimator.state import LN_K, PHI, PITCH, YAW
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 STEP_PLACES = 15        # judgement: places where steps are tested, at equal distances on the path
 TESTED_CONSTANTS = LN_K, YAW, PITCH      # definition: for steps; the scale first
+# judgement: root of the variance factor of a large outlier of the gyro, and smallest turn, rad,
+# that only the gyro measured. In three real drives it is at most 0.02 deg
+GYRO_OUTLIER, MIN_GYRO_TURN = 5.0, np.deg2rad(0.3)
 WARMING_CHANGE = 1e-3      # physical: 1 sigma of the change of the scale in a leg as tyres warm up
 
 
@@ -59,10 +63,27 @@ def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantSte
     sigma = (1 / np.sqrt(np.where(has_information, information, np.inf))).reshape(shape)
     score, t = score.reshape(shape), weighted.state.t[first]
     largest = np.argmax(np.abs(score) * sigma, axis=1)
-    return tuple(ConstantStep(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
-                              float(sigma[i, k]))
-                 for i, (constant, k) in enumerate(zip(TESTED_CONSTANTS, largest, strict=True))
-                 if sigma[i].any())
+    steps = [ConstantStep(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
+                          float(sigma[i, k]))
+             for i, (constant, k) in enumerate(zip(TESTED_CONSTANTS, largest, strict=True))
+             if sigma[i].any()]
+    turn = _turn_of_imu(weighted)
+    return tuple(turn if turn and step.constant == YAW and abs(turn.size) > abs(step.size)
+                 else step for step in steps)
+
+
+def _turn_of_imu(weighted: Weighted) -> ConstantStep | None:
+    """Return the largest turn that only the gyro measured as a step of the yaw, None without."""
+    # the IMU turned on the vehicle; the fit may keep the yaw, and call the gyro an outlier
+    rows = weighted[MotionRows]
+    turn = np.einsum('ki,ki->k', rows.motion.residual[:, PHI], rows.noise.axes[:, 2])
+    outliers = runs(rows.noise.imu[:, IMU.index('gyro')] > GYRO_OUTLIER)
+    turns = [(float(turn[begin:end].sum()), begin, end) for begin, end in outliers]
+    size, begin, end = max(turns, key=lambda x: abs(x[0]), default=(0.0, 0, 0))
+    if abs(size) < MIN_GYRO_TURN:
+        return None
+    sigma = np.sqrt(weighted.levels['gyro'] * rows.motion.T[begin:end].sum())
+    return ConstantStep(YAW, float(weighted.state.t[begin]), -size, float(sigma))
 
 
 def _scores(rows: MotionRows, solved: Solved, first: Ints) -> tuple[Floats, Floats, Floats]:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made, reason_texts
 
+from odocal_ros import read_bag
 from odocal_ros.calib.scale_variation import counter_change_reasons, Sections
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.chain import Normal, solve
@@ -23,6 +24,7 @@ from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.remarks import _change_reasons, MIN_REPORTED_CHANGE
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LN_K, M, PITCH, YAW
+from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
@@ -253,3 +255,24 @@ def test_bias_step_is_reported_as_a_step_and_not_as_noise(stepping):
     # two digits; the step occurs within an interval of 1 s
     assert float(found[1]) * unit == pytest.approx(np.linalg.norm(STEPS[stepping]), rel=0.1)
     assert abs(float(found[3]) - AT) <= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('turn_deg', [0.0, 3.0, -5.0])
+def test_turn_of_the_imu_that_the_vehicle_does_not_make_is_a_step_of_the_yaw(data_dir, turn_deg):
+    """A real car with whole km/h: the fit keeps the yaw, and calls the gyro an outlier."""
+    mounting = [0.0, -np.pi / 2, np.pi / 2]
+    recording = read_bag(data_dir / 'canedge_car_165' / 'bag', {'odometer': '/vehicle/twist'},
+                         {'imu.mounting_rpy': mounting})
+    start_ns, seconds = recording.start_ns + 330 * 10**9, 670
+    leg = recording.recorder.close(start_ns, start_ns + seconds * 10**9)
+    turn = matrix_from_rpy(mounting).T @ [0.0, 0.0, np.deg2rad(turn_deg)]
+    leg = leg.with_rows(imu=turned(leg.imu, start_ns + seconds // 2 * 10**9, turn))
+    result = calibrate(leg, recording.config).methods['smoother']
+    found = re.search('yaw mounting angle changes by about ([^ ]+) deg near t = ([0-9]+) s',
+                      reason_texts(result).get(Code.CHANGE_IN_LEG, ''))
+    assert bool(found) == bool(turn_deg)
+    assert (result.estimates['yaw_mounting_angle'].value is None) == bool(turn_deg)
+    if found:
+        assert float(found[1]) == pytest.approx(turn_deg, rel=0.1)
+        assert abs(float(found[2]) - seconds // 2) < 3
