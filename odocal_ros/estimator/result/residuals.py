@@ -35,7 +35,7 @@ SLIP_VARIANCE = 1.5
 MIN_REPORTED_SLIP = 0.05    # m, judgement: a shorter slip is not reported
 # judgement: least error of the distances between fixes, relative, and least share of their squared
 # residuals that it explains. Explained are 0.87 and 0.96 of fixes 2 and 1.3 times as far apart, at
-# most 0.06 in 16 simulated drives and three real ones
+# most 0.06 in 17 simulated drives and three real ones
 MIN_DISTANCE_ERROR, MIN_EXPLAINED_BY_RATIO = 0.1, 0.5
 # redundancy above which a level is reported. Statistical: its root, with a sigma of root / sqrt(2
 # redundancy), is then REMARK_SIGMAS above zero
