@@ -65,7 +65,7 @@ def test_outliers_among_the_fixes_are_reported(share):
     if share:
         count, of, per_cent, metres = map(float, re.fullmatch(
             r'(\d+) of (\d+) fixes \((\d+) %\) are outliers, up to ([\d.]+) m from the track; '
-            'their weight was reduced', found).groups())
+            'they were down-weighted', found).groups())
         assert per_cent == round(100 * count / of)
         assert count == pytest.approx(share * of, abs=4 * np.sqrt(share * of))      # 4 sigma
         assert metres == pytest.approx(1.5 * 30.0, rel=0.1)       # the largest of many draws

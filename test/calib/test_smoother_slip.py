@@ -15,8 +15,11 @@ from smoother_legs import leg_of, made, reason_texts, smoothed
 from odocal_ros.calib.slip import find_slips, travel_error_sign
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, VARIANCE_FACTOR_COUNT
+from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result import mismatch
 from odocal_ros.estimator.result.estimates import join_names
+from odocal_ros.estimator.result.residuals import find_unexplained_travel
+from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.geodesy import gravity
 from odocal_ros.nav.odometer import Travel
@@ -146,6 +149,14 @@ def test_counts_lost_at_high_speed_are_an_error_of_the_scale(loss):
     assert 'less than the vehicle moves, mostly at constant speed' in reason_text(
         method, Code.TRAVEL_MISSING)
     assert 'unexplained_travel' in {source.name for source in method.sources}
+
+
+def test_a_drive_that_slips_all_the_time_has_no_other_unexplained_travel():
+    _, config, leg = made(duration=120.0)
+    problem = make_problem(leg, config)
+    fit = best_fit(problem, config)
+    slipping_always = replace(fit, variance_factors=np.full_like(fit.variance_factors, 10.0))
+    assert find_unexplained_travel(slipping_always, np.ones(len(fit.variance_factors))) is None
 
 
 @pytest.mark.parametrize('forward', [1.0, -1.0])

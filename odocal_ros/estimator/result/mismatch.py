@@ -173,8 +173,8 @@ def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
         return []
     return [Reason(
         Code.IMU_WORSE_THAN_GRADE, f'the accelerometer has outliers in {100 * share:.0f} % of the '
-        f'time: velocity errors of up to {size.max():.2f} m/s per second; the weight of these '
-        'seconds was reduced',
+        f'time: velocity errors of up to {size.max():.2f} m/s per second; these seconds were '
+        'down-weighted',
         'Likely cause: vibration above half the rate of the IMU (aliasing), or shocks. Use the '
         'low-pass filter of the IMU or a higher rate, and mount it firmly.')]
 
@@ -192,8 +192,8 @@ def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reas
     sigmas = abs(error) / heading.constant_sigma
     return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source_name}) differs by '
                    f'{np.rad2deg(error):+z.2f} deg ({sigmas:.1f} sigma; limit '
-                   f'{REMARK_SIGMAS:g}) from the heading estimated on this drive; its weight was '
-                   'reduced',
+                   f'{REMARK_SIGMAS:g}) from the heading estimated on this drive; it was '
+                   'down-weighted',
                    REMEDIES['heading_fixed' if heading.source_name == 'fixed' else
                             'heading_sent'])]
 

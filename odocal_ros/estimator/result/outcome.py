@@ -108,7 +108,8 @@ def _posterior(problem: Problem, fit: Fit, factor: float, slips: tuple[residuals
     """Return covariance and sigmas of the constants, the errors beyond the fit included."""
     covariance = with_model_floor(fit.covariance * factor**2)
     of_travel = {
-        'slip': abs(sum(slip.metres for slip in slips)) / residuals.path_length(fit),
+        'slip': abs(sum(slip.metres for slip in slips)) / residuals.path_length(fit) if slips
+        else 0.0,
         'unexplained_travel': unexplained.share if unexplained else 0.0}
     beyond_fit = remarks.find_errors_beyond_fit(problem, fit, np.sqrt(np.diag(covariance)),
                                                 of_travel)

@@ -125,7 +125,7 @@ def _imu_reasons(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
         reasons.append(Reason(
             Code.IMU_AXES_SKEW, f'accelerometer axes are {angle:.2f} deg from perpendicular, '
             f'{skew:.0f} times the sigma of the {config.imu.grade} grade '
-            f'(limit {IMU_ERROR_LIMIT:g}); the estimate includes this'))
+            f'(limit {IMU_ERROR_LIMIT:g}); accounted for'))
     worst = max(IMU_SCALES, key=lambda i: error[i])
     if error[worst] > IMU_ERROR_LIMIT:
         name = layout.CONSTANTS[worst].replace('_', ' ')
@@ -133,7 +133,7 @@ def _imu_reasons(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
         reasons.append(Reason(
             Code.IMU_WORSE_THAN_GRADE, f'the {name} is {100 * c[worst]:+z.1f} % off, '
             f'{error[worst]:.0f} times the sigma of the {config.imu.grade} grade '
-            f'(limit {IMU_ERROR_LIMIT:g}); the estimate includes this', f'Set imu.{setting}_sigma '
+            f'(limit {IMU_ERROR_LIMIT:g}); accounted for', f'Set imu.{setting}_sigma '
             f'or imu.grade to its data sheet. If its unit is wrong, set imu.{setting}.'))
     return reasons
 
@@ -159,7 +159,7 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
         return []
     largest = np.hypot(*fixes.raw[outlier, :2].T).max()
     return [Reason(Code.FIX_OUTLIERS, f'{count} of {total} fixes ({100 * count / total:.0f} %) '
-                   f'are outliers, up to {largest:.1f} m from the track; their weight was reduced',
+                   f'are outliers, up to {largest:.1f} m from the track; they were down-weighted',
                    POSE_OUTLIER_REMEDY if problem.leg.origin.is_local else '')]
 
 

@@ -203,12 +203,11 @@ def find_unexplained_travel(fit: Fit, slip_path: Floats) -> UnexplainedTravel | 
     rows, usual = fit.weighted[MotionRows], fit.variance_factors[:, 0] <= SLIP_VARIANCE
     hard, _ = accelerating_and_turning(rows.motion)
     by_state = np.where(usual, -slip_path, 0.0)
-    metres = float(by_state.sum())
-    sigmas = metres / float(np.linalg.norm(rows.along_sigma()[usual]))
-    if abs(sigmas) <= REMARK_SIGMAS:
+    metres, sigma = float(by_state.sum()), float(np.linalg.norm(rows.along_sigma()[usual]))
+    if abs(metres) <= REMARK_SIGMAS * sigma:    # at rest, or if all slip, both are 0
         return None
     steady = abs(by_state[~hard].sum()) > abs(by_state[hard].sum())
-    return UnexplainedTravel(metres, sigmas, abs(metres) / path_length(fit), bool(steady))
+    return UnexplainedTravel(metres, metres / sigma, abs(metres) / path_length(fit), bool(steady))
 
 
 def describe_slip_level(fit: Fit, marginals: JointMarginals, count_m: float) -> str:
