@@ -164,7 +164,8 @@ class FrameFilter:
         other_frames, stamps = [], []
         for i in np.flatnonzero(~keep).tolist():
             frame = self._frame(raws[i], deserialize)
-            if frame is None or frame == self.frame:        # damaged, or of another layout
+            # damaged, of another layout, or with or without the leading slash of ROS 1
+            if frame is None or frame.removeprefix('/') == self.frame.removeprefix('/'):
                 keep[i] = True
             else:
                 other_frames.append(frame.encode()[:FRAME_BYTES])

@@ -74,6 +74,16 @@ def test_a_damaged_frame_is_ignored_and_a_configured_frame_is_used():
     assert len(found['imu_other'].stamp_ns) == 5
 
 
+@pytest.mark.parametrize(('frames', 'frame_id'), [
+    (['imu', '/imu'], ''), (['/imu', 'imu'], ''), (['imu', '/imu'], 'imu'),
+    (['imu', '/imu'], '/imu')])
+def test_a_leading_slash_does_not_make_another_frame(frames, frame_id):
+    found, reader = read(np.repeat(frames, 10).tolist(), frame_id=frame_id)
+    assert found.keys() == {'imu'}
+    assert len(found['imu'].stamp_ns) == 20
+    assert reader.frame == (frame_id or frames[0])
+
+
 def mixed(made, every):
     """Return the topics of a drive whose IMU topic has a second IMU, yawed by 20 deg."""
     C = matrix_from_rpy((0.0, 0.0, np.deg2rad(20.0)))
