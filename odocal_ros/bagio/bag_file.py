@@ -120,7 +120,7 @@ class BagFile:
         raise NotImplementedError
 
     def _fast_batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
-        """Return the messages as stored, in batches; None if the format has no fast reader."""
+        """Return the messages as stored, in batches; None if the file has no fast reader."""
         return None
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.bagio.bag_file import Batch, Channel
-from odocal_ros.bagio.mcap_records import Chunk, ChunkIndex, MESSAGE, MESSAGE_INDEX, RECORD
+from odocal_ros.bagio.mcap_records import Chunk, ChunkIndex, Entry, MESSAGE, MESSAGE_INDEX, RECORD
 from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.messages.raws import RawMessages, Rows
 from odocal_ros.safe_io.limits import Damaged, LATEST_NS
@@ -43,8 +43,7 @@ class Columns(NamedTuple):
 
 ChunkBlock = list[Chunk | Damaged]      # chunks; the damage of those not readable
 ReadChunks = Callable[[Sequence[ChunkIndex]], ChunkBlock]     # reads adjacent chunks
-# returns time, channel and bytes of each message, or raises Damaged
-ScanChunk = Callable[[Chunk], Sequence[tuple[int, int, bytes]]]
+ScanChunk = Callable[[Chunk], Sequence[Entry]]     # or raises Damaged
 ReportDamage = Callable[[Damaged], None]
 
 
@@ -195,7 +194,7 @@ def _record_offsets(chunk: Chunk) -> Ints:
     return np.concatenate(offsets) + chunk.begin
 
 
-def _columns_of_messages(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
+def _columns_of_messages(entries: Sequence[Entry]) -> Columns:
     return Columns(np.array([entry[0] for entry in entries], np.int64),
                    np.array([entry[1] for entry in entries], np.uint16),
                    RawMessages.joined([entry[2] for entry in entries]))

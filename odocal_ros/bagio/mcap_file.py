@@ -4,23 +4,20 @@
 """
 Read an mcap file: topics, counts and messages.
 
-With a valid index only the chunks with the wanted topics are read. Without one, or in a damaged
+With a valid index only the chunks with the requested topics are read. Without one, or in a damaged
 file, records are read from the start of the file, as far as they are valid.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-import heapq
 from operator import itemgetter
 from pathlib import Path
 import struct
 import zlib
 
-from odocal_ros.bagio import bag_file, mcap_records as mcap
+from odocal_ros.bagio import mcap_records as mcap
 from odocal_ros.bagio.bag_file import BagFile, Batch, Channel, FileBytes, FORMATS
 from odocal_ros.bagio.mcap_columns import batches
 from odocal_ros.safe_io.limits import Allowance, Damaged, LATEST_NS
-
-Entry = tuple[int, int, bytes]     # time, ns, number of the channel, message
 
 
 class McapFile(BagFile):
@@ -87,37 +84,31 @@ class McapFile(BagFile):
         return True
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
-        """Yield the messages of some topics (name -> type) by time; by chunk without an index."""
+        """Yield the messages of some topics (name -> type), by time in each chunk."""
         channels = self._channels_of(topics)
         self._allowance.restart()
-        entries = self._by_time(channels) if self._chunks else (
-            entry for entry in self._scan_records() if entry[1] in channels)
-        for time_ns, number, raw in entries:
-            yield channels[number], time_ns, raw
+        for time_ns, number, raw in self._scan_records():
+            if number in channels:
+                yield channels[number], time_ns, raw
         self._recount()
 
     def _fast_batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
-        """Return the messages in batches; None without an index that matches the chunks."""
-        channels = self._channels_of(topics)
-        chunks = self._chunks_with(channels)
-        times_begin, times_end = mcap.RECORD.size, mcap.RECORD.size + mcap.TIMES.size
-        if not self._chunks or any(
-                self._file[chunk.offset + times_begin:chunk.offset + times_end]
-                != mcap.TIMES.pack(chunk.start_ns, chunk.end_ns) for chunk in chunks):
-            return None
-        return self._indexed_batches(chunks, channels)
+        """Return the messages in batches; None without an index."""
+        return self._indexed_batches(self._channels_of(topics)) if self._chunks else None
 
-    def _chunks_with(self, channels: Mapping[int, Channel]) -> list[mcap.ChunkIndex]:
-        """Return the chunks that may have messages of some channels."""
-        return [chunk for chunk in self._chunks
-                if not chunk.channels or chunk.channels & channels.keys()]
-
-    def _indexed_batches(self, chunks: list[mcap.ChunkIndex],
-                         channels: Mapping[int, Channel]) -> Iterator[Batch]:
+    def _indexed_batches(self, channels: Mapping[int, Channel]) -> Iterator[Batch]:
         self._allowance.restart()
+        chunks = sorted(self._with_own_times(chunk) for chunk in self._chunks
+                        if not chunk.channels or chunk.channels & channels.keys())
         yield from batches(chunks, channels, self._channels, self._read_chunks,
                            self._messages_by_scan, self._report_damage)
         self._recount()
+
+    def _with_own_times(self, chunk: mcap.ChunkIndex) -> mcap.ChunkIndex:
+        """Return the entry of a chunk with the times that the chunk itself states."""
+        begin = chunk.offset + mcap.RECORD.size
+        start_ns, end_ns = mcap.TIMES.unpack(self._file[begin:begin + mcap.TIMES.size])
+        return chunk._replace(start_ns=start_ns, end_ns=end_ns)
 
     def _read_chunks(self, chunks: Sequence[mcap.ChunkIndex]) -> list[mcap.Chunk | Damaged]:
         """Return adjacent chunks from the file, each with its message index."""
@@ -145,42 +136,24 @@ class McapFile(BagFile):
             self._count()
             self._counted_damage = self.damage
 
-    def _by_time(self, channels: Mapping[int, Channel]) -> Iterator[Entry]:
-        """Yield messages in order of time; chunks that overlap in time are merged."""
-        for group in bag_file.group_overlapping(self._chunks_with(channels)):
-            yield from self._merged(group, channels)
-
-    def _merged(self, chunks: list[mcap.ChunkIndex],
-                channels: Mapping[int, Channel]) -> Iterator[Entry]:
-        def entries(chunk: mcap.ChunkIndex) -> Iterator[Entry | tuple[int]]:
-            # heapq.merge takes a first entry of every chunk before it yields any: this one, so
-            # that a chunk is not unpacked before its start time
-            yield (chunk.start_ns,)
-            yield from self._messages_of(chunk, channels)
-        return (entry for entry in heapq.merge(*map(entries, chunks), key=itemgetter(0))
-                if len(entry) > 1)
-
-    def _messages_of(self, index: mcap.ChunkIndex, channels: Mapping[int, Channel]) -> list[Entry]:
-        """Return the messages of a chunk of the index, sorted; [] if it is damaged."""
-        try:
-            (chunk,) = self._read_chunks([index])
-            if isinstance(chunk, Damaged):
-                raise chunk
-            messages = self._messages_by_scan(chunk)
-        except Damaged as error:
-            self._report_damage(error)
-            return []
-        return [entry for entry in messages if entry[1] in channels]
-
     def _scan(self) -> Iterator[tuple[int, int]]:
-        """Return (channel number, time in ns) of every readable message."""
+        """Yield channel number and time, ns, of every readable message."""
         self._allowance.restart()
-        entries = (entry for chunk in self._chunks
-                   for entry in self._messages_of(chunk, self._channels)
-                   ) if self._chunks else self._scan_records()
-        return ((number, time_ns) for time_ns, number, _ in entries)
+        for time_ns, number, _ in self._scan_index() if self._chunks else self._scan_records():
+            yield number, time_ns
 
-    def _scan_records(self) -> Iterator[Entry]:
+    def _scan_index(self) -> Iterator[mcap.Entry]:
+        """Yield every message in the chunks of the index."""
+        for index in self._chunks:
+            (chunk,) = self._read_chunks([index])
+            try:
+                if isinstance(chunk, Damaged):
+                    raise chunk
+                yield from self._messages_by_scan(chunk)
+            except Damaged as error:
+                self._report_damage(error)
+
+    def _scan_records(self) -> Iterator[mcap.Entry]:
         """Yield every message from the first record on, chunk by chunk."""
         for op, body, is_complete in mcap.records_of(self._file, len(mcap.MAGIC)):
             try:
@@ -196,7 +169,7 @@ class McapFile(BagFile):
                 self._report_damage(
                     error if isinstance(error, Damaged) else Damaged('invalid record'))
 
-    def _messages_by_scan(self, chunk: mcap.Chunk, is_truncated: bool = False) -> list[Entry]:
+    def _messages_by_scan(self, chunk: mcap.Chunk, is_truncated: bool = False) -> list[mcap.Entry]:
         """Return the messages of a chunk by time, from a sequential scan."""
         messages = self._entries(bytes(chunk.records), is_truncated)
         messages.sort(key=itemgetter(0))
@@ -206,7 +179,7 @@ class McapFile(BagFile):
                 raise Damaged(mcap.CHUNK_DAMAGED)
         return messages
 
-    def _entries(self, records: bytes, is_truncated: bool) -> list[Entry]:
+    def _entries(self, records: bytes, is_truncated: bool) -> list[mcap.Entry]:
         """Return the messages of a chunk; raise Damaged if any of its records is invalid."""
         messages, offset, end = [], 0, len(records)
         while (content := offset + mcap.RECORD.size) <= end:
@@ -228,7 +201,7 @@ class McapFile(BagFile):
             raise Damaged(mcap.CHUNK_DAMAGED)
         return messages
 
-    def _entry(self, body: bytes) -> Entry:
+    def _entry(self, body: bytes) -> mcap.Entry:
         """Return the message in the content of a record; raise Damaged or struct.error."""
         number, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
         if number not in self._channels or time_ns >= LATEST_NS:

@@ -35,6 +35,9 @@ TIMES = struct.Struct('<QQ')                # start and end of a chunk
 FOOTER_SIZE = RECORD.size + 20 + len(MAGIC)     # format: bytes of the footer record and the magic
 
 
+Entry = tuple[int, int, bytes]     # bag time, ns, channel number, message
+
+
 class ChunkIndex(NamedTuple):
     """Entry of a chunk in the index, as stated; offset and size are those of its record, bytes."""
 

@@ -91,6 +91,18 @@ def test_records_are_read_without_an_index_and_chunks_are_unchanged(tmp_path):
         vars(chunk) for chunk in packed]
 
 
+def test_messages_are_in_order_of_time_if_the_index_states_other_times(tmp_path):
+    (first, messages), (second_chunks, later) = second(0), second(1)
+    path = tmp_path / 'part.mcap'
+    write_file(path, CHANNELS, first + second_chunks)
+    data = path.read_bytes()
+    summary = struct.unpack_from('<Q', data, len(data) - 28)[0]
+    one, two = (struct.pack('<QQ', c[0].start_ns, c[0].end_ns) for c in (first, second_chunks))
+    swapped = data[summary:].replace(one, b'-' * 16).replace(two, one).replace(b'-' * 16, two)
+    path.write_bytes(data[:summary] + swapped)
+    assert read(path) == {topic: messages[topic] + later[topic] for topic in messages}
+
+
 @pytest.mark.parametrize('zstd', [True, False])
 def test_the_index_of_a_chunk_points_at_its_messages(monkeypatch, zstd):
     # rosbags reads without it, the readers of ros2 bag and Foxglove do not

@@ -43,7 +43,7 @@ def read(path):
 def both(path, monkeypatch):
     by_columns = read(path)
     with monkeypatch.context() as patch:
-        patch.setattr(McapFile, '_fast_batches', lambda *_: None)
+        patch.setattr(mcap_columns, '_columns_by_index', lambda *_: None)
         return by_columns, read(path)
 
 
