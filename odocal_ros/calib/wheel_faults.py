@@ -26,6 +26,7 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import robust_sigma
 from odocal_ros.reasons import Reason
+from odocal_ros.screening.inputs import ImuRows
 from odocal_ros.screening.wheel_faults import WheelPair, wheels_on_grid
 
 # steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s; others are detected too.
@@ -53,23 +54,21 @@ class Window(NamedTuple):
     is_large: Bools      # (n,) True beyond the limit
 
 
-def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
+def wheel_faults(axle: Sequence[Travel], imu: ImuRows,
                  marks: tuple[float, float], track: Track, latitude: float,
                  metres_per_unit: float, track_width: float = 0.0,
-                 uncertain_t: Floats | None = None, max_deviation: float = 0.35,
+                 uncertain_t: Sequence[float] | Floats = (), max_deviation: float = 0.35,
                  wheel_count: int = 2) -> tuple[tuple[Reason, ...], slip.WheelSlips]:
     """
     Return the faults of two counting wheels by the gyro, and the slips of one of them.
 
-    axle : travel of the left and the right wheel.   imu : (t, w_b, f_b) (n,) s, (n, 3) rad/s,
-    (n, 3) m/s^2, with their bias.   marks : start and stop, s.   track : dead reckoned with the
-    mean of both, for attitudes.   latitude : rad.   metres_per_unit : approximate scale of the
-    mean.   track_width : m, 0 unknown.   uncertain_t : (d,) s, times of travel that is uncertain
-    for other reasons (gaps, resets).   max_deviation : limit of the ratio of the counts minus one.
+    axle : left and right wheel.   marks : start and stop, s.   track : dead reckoned with the mean
+    of both, for attitudes.   latitude : rad.   metres_per_unit : approximate scale of the mean.
+    track_width : m, 0 unknown.   uncertain_t : (d,) s, times of travel that is uncertain for
+    other reasons (gaps, resets).   max_deviation : limit of the ratio of the counts minus one.
     wheel_count : number of wheels in the mean.
     """
-    pair = wheels_on_grid(axle, imu, marks, slip.SLIP_GRID,
-                          np.empty(0) if uncertain_t is None else uncertain_t)
+    pair = wheels_on_grid(axle, imu, marks, slip.SLIP_GRID, uncertain_t)
     if pair is None or not metres_per_unit:
         return (), slip.NO_SLIPS
     pair = regression.without_gyro_drift(pair)
@@ -118,11 +117,12 @@ def _without_slope(pair: WheelPair, residual: Floats, quantum_m: float) -> Float
 
 
 def _without_slips(pair: WheelPair, events: list[Event]) -> WheelPair:
-    """Return the wheels, with the cells of slips marked as unknown."""
-    known, margin = pair.known.copy(), 2.0       # s each side, possibly part of the slip
+    """Return the wheels, with the cells of slips marked as incomplete."""
+    is_complete = pair.is_complete.copy()
+    margin = 2.0       # s each side, possibly part of the slip
     for event in events:
-        known &= (pair.t[1:] < event.begin - margin) | (pair.t[:-1] > event.end + margin)
-    return replace(pair, known=known)
+        is_complete &= (pair.t[1:] < event.begin - margin) | (pair.t[:-1] > event.end + margin)
+    return replace(pair, is_complete=is_complete)
 
 
 def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
@@ -133,7 +133,7 @@ def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
     residual = _without_slope(pair, residual, quantum_m)
     total = running_sum(residual)
     mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
-    unknown = running_sum(~pair.known)
+    incomplete = running_sum(~pair.is_complete)
     significant = np.zeros(len(pair.t), bool)
     windows = []
     for span in (gap + MEAN_STEPS for gap in SLIP_SPANS):
@@ -141,7 +141,7 @@ def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
         if len(jump) < span:
             continue
         limit = _jump_limits(pair, jump, span, quantum_m * (pair.quantum > 0), width)
-        has_gap = unknown[span + MEAN_STEPS - 1:][:len(jump)] != unknown[:len(jump)]
+        has_gap = incomplete[span + MEAN_STEPS - 1:][:len(jump)] != incomplete[:len(jump)]
         is_large = (np.abs(jump) > limit) & ~has_gap
         for k in np.flatnonzero(is_large):
             significant[k + MEAN_STEPS:k + span] = True
@@ -227,7 +227,7 @@ def _measure_event(pair: WheelPair, residual: Floats, windows: list[Window], beg
                  float(pair.t[first + max(last_low, first_high)]), size)
 
 
-def _find_wheel(pair: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
+def _find_wheel(pair: WheelPair, mean: Floats, imu: ImuRows, track: Track,
                 latitude: float, event: Event) -> int:
     """Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it."""
     # a slip of the right wheel by x moves the mean path of the wheels, m, by x / 2 relative to the
@@ -239,7 +239,7 @@ def _find_wheel(pair: WheelPair, mean: Floats, imu: tuple[Floats, Floats, Floats
     span = max(round((end - begin + 2 * margin) / slip.EXCESS_GRID), 4 * slip.END_STEPS)
     if len(grid) < 3 * span:
         return 0
-    a = slip.acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)
+    a = slip.acceleration(grid, imu.t, imu.f_b, track, np.array([1.0, 0.0, 0.0]), latitude)
     excess = slip.excess_path(span, a, np.interp(grid, pair.t, mean))
     turn = np.interp(grid, pair.t, pair.turn)[slip.END_STEPS:-slip.END_STEPS]
     straight = np.abs(turn[span:] - turn[:-span]) < slip.MAX_WINDOW_TURN

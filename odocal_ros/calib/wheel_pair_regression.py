@@ -17,7 +17,8 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, running_sum, runs
 from odocal_ros.nav.time_series import running_mean
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.wheel_faults import robust_fit, SENT_TWICE_REMEDY, WheelPair
+from odocal_ros.screening.robust_fit import robust_fit
+from odocal_ros.screening.wheel_faults import SENT_TWICE_REMEDY, WheelPair
 from odocal_ros.settings.levels import TRACK_WIDTH
 
 # statistical: sigmas of a significant difference of wheels: by chance once in 500 million windows;
@@ -42,10 +43,10 @@ MIN_TRAVEL_SIGMA = 0.4, 1e-3
 
 def without_gyro_drift(pair: WheelPair) -> WheelPair:
     """Return the wheels with the gyro bias, measured at standstills, removed from the turn."""
-    still = pair.known & (np.diff(pair.left) == 0) & (np.diff(pair.right) == 0)
+    still = pair.is_complete & (np.diff(pair.left) == 0) & (np.diff(pair.right) == 0)
     # half a second after a stop and before a start the body rocks
     rests = [(begin + MEAN_STEPS // 2, end - MEAN_STEPS // 2) for begin, end in runs(still)
-             if (end - begin) * pair.step >= BIAS_REST]
+             if (end - begin) * pair.cell_s >= BIAS_REST]
     if not rests:
         return pair
     begin, end = np.transpose(rests)
@@ -53,7 +54,7 @@ def without_gyro_drift(pair: WheelPair) -> WheelPair:
     is_bias = np.abs(rate - np.median(rate)) < MAX_DRIFT
     middle = (pair.t[begin] + pair.t[end]) / 2
     bias = np.interp(pair.t[:-1], middle[is_bias], rate[is_bias])
-    return replace(pair, turn=pair.turn - running_sum(bias * pair.step))
+    return replace(pair, turn=pair.turn - running_sum(bias * pair.cell_s))
 
 
 def right_path_regressors(pair: WheelPair, metres_per_unit: float) -> Floats:
@@ -65,9 +66,9 @@ def right_path_regressors(pair: WheelPair, metres_per_unit: float) -> Floats:
     acceleration moves from tyre to tyre.
     """
     mean = (pair.left + pair.right) / 2
-    speed, rate = (running_mean(np.gradient(x, pair.step), MEAN_STEPS // 2)
+    speed, rate = (running_mean(np.gradient(x, pair.cell_s), MEAN_STEPS // 2)
                    for x in (mean, pair.turn))
-    load = running_sum(metres_per_unit * (speed**2 * rate)[1:] * pair.step)
+    load = running_sum(metres_per_unit * (speed**2 * rate)[1:] * pair.cell_s)
     return np.stack([pair.left, pair.turn, pair.t - pair.t[0], speed, rate, load], -1)
 
 
@@ -80,7 +81,7 @@ def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
     """
     edges = np.arange(0, len(pair.t), MEAN_STEPS)      # of cells of a second
     design, y = np.diff(regressors[edges], axis=0), np.diff(pair.right[edges])
-    keep = np.logical_and.reduceat(pair.known, edges[:-1])[:len(y)]
+    keep = np.logical_and.reduceat(pair.is_complete, edges[:-1])[:len(y)]
     keep &= np.abs(design[:, 0]) + np.abs(y) > 2 * pair.quantum
     if keep.sum() < MIN_FIT_CELLS:
         return None

@@ -14,11 +14,11 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.odometer import mean_travel, Travel
 from odocal_ros.nav.time_series import running_integral, running_mean
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.inputs import ImuRows
+from odocal_ros.screening.robust_fit import robust_fit
 from odocal_ros.screening.wheel_faults import (
     broken_wheel_reasons,
-    Imu,
     percent_text,
-    robust_fit,
     STALLED_SHARE,
     wheels_on_grid,
 )
@@ -40,15 +40,13 @@ def pair_wheels(wheels: Sequence[Wheel]) -> list[tuple[Wheel, ...]]:
     return [tuple(wheels[k:k + 2]) for k in range(0, len(wheels), 2)]
 
 
-def usable_axles(wheels: LegWheels, imu: Imu,
+def usable_axles(wheels: LegWheels, imu: ImuRows,
                  marks: tuple[float, float]) -> tuple[LegWheels, list[Reason]]:
     """
     Return the usable wheels, with ``distance_ahead`` of steered ones, and reasons.
 
-    imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   marks : start and stop, s.
-
-    A broken axle is left out if another one is usable and does not steer: one wheel does not
-    measure the travel of the axle's middle.
+    marks : start and stop, s. A broken axle is left out if another one is usable and does not
+    steer: one wheel does not measure the travel of the axle's middle.
     """
     axles = pair_wheels(wheels.wheels)
     faults = [_axle_faults(axle, axles, imu, marks) for axle in axles]
@@ -77,30 +75,30 @@ def usable_axles(wheels: LegWheels, imu: Imu,
 
 def _working_wheel(axle: Axle, faults: Sequence[Reason]) -> Axle:
     """Return the working wheel of a broken axle, () if it is not certain."""
-    rolled = [_path_length(wheel) for wheel in axle]
+    paths = [_path_length(wheel) for wheel in axle]
     one_dead = len(axle) > 1 and {fault.code for fault in faults} == {Code.WHEEL_DEAD}
-    return (axle[int(np.argmax(rolled))],) if one_dead and max(rolled) > 0 else ()
+    return (axle[int(np.argmax(paths))],) if one_dead and max(paths) > 0 else ()
 
 
 def _path_length(wheel: Travel) -> float:
     return float(np.abs(np.diff(wheel.s)).sum())
 
 
-def _axle_faults(axle: Axle, axles: list[Axle], imu: Imu,
-            marks: tuple[float, float]) -> tuple[Reason, ...]:
+def _axle_faults(axle: Axle, axles: list[Axle], imu: ImuRows,
+                 marks: tuple[float, float]) -> tuple[Reason, ...]:
     """Return the faults of an axle; a single wheel is compared with the first axle."""
     longest = max(_path_length(wheel) for other in axles for wheel in other)
-    rolled = max(map(_path_length, axle))
-    if rolled <= STALLED_SHARE * longest:
+    path = max(map(_path_length, axle))
+    if path <= STALLED_SHARE * longest:
         return (Reason(Code.WHEEL_DEAD, f'{_names(axle)} did not count: the travel is '
-                       f'{percent_text(rolled, longest)} of that of the wheel that travels most '
+                       f'{percent_text(path, longest)} of that of the wheel that travels most '
                        f'(limit {100 * STALLED_SHARE:g} %)'),) if longest else ()
     if len(axle) == 1:
         axle = (*axle, replace(mean_travel(axles[0]), name='mean'))
     return broken_wheel_reasons(axle, imu, marks)
 
 
-def _distances_ahead(axles: list[Axle], imu: Imu, marks: tuple[float, float],
+def _distances_ahead(axles: list[Axle], imu: ImuRows, marks: tuple[float, float],
                      uncertain_t: Floats) -> list[float]:
     """Return distances ahead of the axle that steers least, scale units; inf for an axle ()."""
     tested = [k for k, axle in enumerate(axles) if axle]
@@ -115,7 +113,7 @@ def _distances_ahead(axles: list[Axle], imu: Imu, marks: tuple[float, float],
     return distances.tolist()
 
 
-def _squared_distance(axle: Travel, other: Travel, imu: Imu, marks: tuple[float, float],
+def _squared_distance(axle: Travel, other: Travel, imu: ImuRows, marks: tuple[float, float],
                       uncertain_t: Floats) -> tuple[float, float]:
     """Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible."""
     # its travel is that of the other axle, the additional path of a steered axle times the squared
@@ -127,13 +125,13 @@ def _squared_distance(axle: Travel, other: Travel, imu: Imu, marks: tuple[float,
     steering = steering_path(pair.t, pair.turn, pair.right)
     design = np.diff(np.stack([pair.right, steering, pair.turn], -1)[edges], axis=0)
     y = np.diff(pair.left[edges])
-    keep = np.logical_and.reduceat(pair.known, edges[:-1])[:len(y)] & (
+    use = np.logical_and.reduceat(pair.is_complete, edges[:-1])[:len(y)] & (     # for each cell
         np.abs(y) > 2 * pair.quantum)
-    if keep.sum() < CELL_STEPS or not design[keep, 1].any():
+    if use.sum() < CELL_STEPS or not design[use, 1].any():
         return 0.0, 0.0
-    x, covariance, _ = robust_fit(design[keep], y[keep], pair.min_sigma(y[keep]))
-    additional_path = abs(x[1]) * np.abs(design[keep, 1]).sum()
-    if additional_path <= MIN_STEERED_SHARE * np.abs(y[keep]).sum():
+    x, covariance, _ = robust_fit(design[use], y[use], pair.min_sigma(y[use]))
+    additional_path = abs(x[1]) * np.abs(design[use, 1]).sum()
+    if additional_path <= MIN_STEERED_SHARE * np.abs(y[use]).sum():
         return 0.0, 0.0
     return float(x[1]), float(np.sqrt(covariance[1, 1]))
 

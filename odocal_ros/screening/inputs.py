@@ -27,6 +27,14 @@ class UsableRows(NamedTuple):
     t: Floats
 
 
+class ImuRows(NamedTuple):
+    """Rows of an IMU, with its biases."""
+
+    t: Floats      # (n,) s
+    w_b: Floats    # (n, 3) rad/s
+    f_b: Floats    # (n, 3) m/s^2
+
+
 @dataclass(frozen=True, eq=False)
 class Inputs:
     """
@@ -57,6 +65,10 @@ class Inputs:
     is_local: bool = False             # True: fixes are positions in a local frame
     # corrected delays of clocks seconds from the IMU's, by group of settings: s, > 0 late
     clock_delays: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def imu(self) -> ImuRows:
+        return ImuRows(self.t_imu, self.w_b, self.f_b)
 
     @cached_property
     def median_f_b(self) -> Floats:

@@ -11,6 +11,8 @@ remains; delays beyond it are removed if travel is smoother on the rhythm. Rows 
 not fit the rhythm, because rows were lost, get times by their travel.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints, median, running_sum, runs
@@ -29,6 +31,22 @@ MIN_JITTER = 1e-4       # s, judgement: smallest deviation from the rhythm that 
 ROUNDING_COUNTS = 2.5     # judgement: largest deviation of a row by rounding
 
 
+class Rhythm(NamedTuple):
+    """Evenly spaced sampling times of rows."""
+
+    roughness: float    # of travel at these times, over that at the stamps
+    interval: float     # s
+    t: Floats           # (n,) s
+
+
+class LateRun(NamedTuple):
+    """Adjacent late rows."""
+
+    begin: int            # first row
+    end: int              # row after the last one
+    fits_rhythm: bool     # travel is smooth at the times of the rhythm
+
+
 def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm,
                    name: str = 'odometer') -> tuple[Floats, list[Reason]]:
     """Return the sampling times, (n,) s, of rows stamped at t, and the reason if rows are late."""
@@ -37,8 +55,8 @@ def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm,
     is_integer = np.issubdtype(samples.value.dtype, np.integer)
     if form.quantity == 'rate':
         # a speed is as smooth as travel, but does not determine the time of a row in a burst
-        _, even, is_smoother = _smoothest_rhythm(t, samples.value.astype(float))
-        sampled = _rising(even) if is_smoother else t
+        rhythm, is_smoother = _smoothest_rhythm(t, samples.value.astype(float))
+        sampled = _rising(rhythm.t) if is_smoother else t
     else:
         step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
                 else samples.value[1:].astype(float))
@@ -86,15 +104,16 @@ def intervals(t: Floats) -> list[float]:
 
 def _correct_bursts(t: Floats, travel: Floats, rounding: float) -> Floats:
     """Return the sampling times of rows of travel, (n,); rounding: largest error of travel."""
-    interval, even, is_smoother = _smoothest_rhythm(t, travel)
+    rhythm, is_smoother = _smoothest_rhythm(t, travel)
     min_delay, delay_share = 0.004, 0.1    # s, of an interval: the larger is the limit
-    late = t - even > (interval if is_smoother else max(min_delay, delay_share * interval))
-    sampled = even.copy() if is_smoother else t.copy()
-    for begin, end, fits in _late_runs(t, even, travel, late, rounding):
-        if fits:
-            sampled[begin:end] = even[begin:end]
+    late = t - rhythm.t > (rhythm.interval if is_smoother else
+                           max(min_delay, delay_share * rhythm.interval))
+    sampled = (rhythm.t if is_smoother else t).copy()
+    for begin, end, fits_rhythm in _late_runs(t, rhythm.t, travel, late, rounding):
+        if fits_rhythm:
+            sampled[begin:end] = rhythm.t[begin:end]
         elif begin > 0 and end < len(t):
-            sampled[begin:end] = _times_by_travel(t, travel, begin - 1, end, interval)
+            sampled[begin:end] = _times_by_travel(t, travel, begin - 1, end, rhythm.interval)
     return _rising(sampled)
 
 
@@ -105,8 +124,8 @@ def _rising(t: Floats) -> Floats:
 
 
 def _late_runs(t: Floats, even: Floats, travel: Floats, late: Bools,
-               rounding: float) -> list[tuple[int, int, bool]]:
-    """Return begin and end of the runs of late rows, and True if travel fits the even times."""
+               rounding: float) -> list[LateRun]:
+    """Return the runs of late rows, (n,) bool; even : (n,) s, the times of the rhythm."""
     begin, end = runs(late).T
     if not len(begin):
         return []
@@ -123,26 +142,24 @@ def _late_runs(t: Floats, even: Floats, travel: Floats, late: Bools,
     largest = np.maximum.reduceat(np.abs(deviation[1]), ends)[::2]
     fitting_share = 0.25    # of the deviation at the stamps: more remains if a row is lost
     fits = (largest <= rounding) | (at_even < fitting_share * at_stamps)
-    return list(zip(begin.tolist(), end.tolist(), fits.tolist(), strict=True))
+    return list(map(LateRun, begin.tolist(), end.tolist(), fits.tolist()))
 
 
-def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
-    """Return the interval, times on the smoothest rhythm, True if travel is smoother on it."""
+def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[Rhythm, bool]:
+    """Return the rhythm at which travel is smoothest, and True if it is smoother than at t."""
     # of equally smooth ones the first is used, by medians: that of the earliest rows has steps
-    candidates = [
-        (_unevenness(t, even, travel), interval, even) for interval in reversed(intervals(t))
-        for even in (*_rhythm_of_median(t, interval), _rhythm_of_earliest(t, interval))]
-    lowest = min(ratio for ratio, _, _ in candidates)
-    smoother_ratio, equal_ratio = 0.9, 1.1    # judgement: limits of the ratio, over that of others
-    is_smoother = lowest < smoother_ratio
-    _, interval, even = next(candidate for candidate in candidates
-                             if candidate[0] <= equal_ratio * lowest) \
-        if is_smoother else candidates[-1]
-    return interval, even, is_smoother
+    rhythms = [Rhythm(_roughness(t, even, travel), interval, even)
+               for interval in reversed(intervals(t))
+               for even in (*_rhythm_of_median(t, interval), _rhythm_of_earliest(t, interval))]
+    lowest = min(rhythm.roughness for rhythm in rhythms)
+    smoother_limit, equal_ratio = 0.9, 1.1    # judgement: of the roughness, and over the lowest
+    if lowest >= smoother_limit:
+        return rhythms[-1], False
+    return next(rhythm for rhythm in rhythms if rhythm.roughness <= equal_ratio * lowest), True
 
 
-def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
-    """Return roughness of travel on a rhythm over that at t, by rows that are not on it."""
+def _roughness(t: Floats, even: Floats, travel: Floats) -> float:
+    """Return the roughness of travel at even times over that at t, from rows that differ."""
     rows = np.flatnonzero(np.abs(t - even) > MIN_JITTER)
     rows = rows[::1 + len(rows) // TESTED_ROWS]
     deviation = np.array([np.abs(_cubic_deviation(x, travel, rows)) for x in (t, even)])
@@ -160,8 +177,8 @@ def _rhythm_of_earliest(t: Floats, interval: float) -> Floats:
     window = min(int(ON_TIME_WINDOW / interval) + 1, len(t))
     earliest = _running_minimum(t - rows, window)
     # in the last window, an increase by whole intervals is caused by lost rows
-    end, jitter = earliest[len(t) - window:], 0.25     # of an interval: allowance for jitter
-    end[:] = end[0] + interval * np.floor((end - end[0]) / interval + jitter)
+    last, jitter = earliest[len(t) - window:], 0.25     # of an interval: allowance for jitter
+    last[:] = last[0] + interval * np.floor((last - last[0]) / interval + jitter)
     even = rows - _running_minimum(-earliest[::-1], window)[::-1]
     return even + np.median(t - even)      # a constant delay is not corrected
 
@@ -217,7 +234,7 @@ def _cubic_deviation(t: Floats, travel: Floats, rows: Ints) -> Floats:
 
 def _times_by_travel(t: Floats, travel: Floats, before: int, after: int,
                      interval: float) -> Floats:
-    """Return the times of the rows between two rows by travel, if they are a burst."""
+    """Return the times of the rows between two rows: by travel if they are a burst, else t."""
     # a burst is short, and its apparent speed far above the adjacent speeds: constant speed is
     # assumed
     rows = np.arange(before + 1, after)

@@ -1,10 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Odometer rows with false values: false counts, frozen counters, lost increments."""
+"""
+Odometer rows with false values (false counts, frozen counters), and travel that was not measured.
+
+In: rows of one wheel. Out: corrected rows, or travel with the sigma where it is interpolated.
+"""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +23,16 @@ from odocal_ros.screening.glitches import is_impossible, speed_glitches
 ADJACENT_STEPS = 5    # judgement: steps next to a jump or gap that give the speed there
 # judgement: largest apparent travel at rest, by the unit of the scale factor: counts, rad, m
 REST_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
+
+
+class UncertainTravel(NamedTuple):
+    """Times at which travel is uncertain."""
+
+    t: Floats        # (k,) s
+    sigma: Floats    # (k,) scale units
+
+
+CERTAIN = UncertainTravel(np.empty(0), np.empty(0))    # definition: no uncertain travel
 
 
 def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
@@ -36,8 +50,9 @@ def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
         is_new = ~repeated_counts(samples.value, form.modulus)
         return take(samples, is_new), t[is_new], reasons
     value = samples.value
-    false = speed_glitches(t, value.astype(float)) if form.quantity == 'increment' \
-        else np.zeros(len(t), bool)
+    if form.quantity == 'rate':
+        return samples, t, []
+    false = speed_glitches(t, value.astype(float))
     if false.any():
         interpolated = np.interp(t, t[~false], value[~false].astype(float))
         corrected: NDArray[Any] = np.where(false, interpolated, value).astype(value.dtype)
@@ -80,8 +95,8 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     for jump in jumps:
         if jump <= last_false:
             continue
-        freeze = _first_zero_step(step, jump)
-        candidates = [(freeze, jump)] * (freeze < jump) + [      # first and last step
+        frozen_from = _first_zero_step(step, jump)
+        candidates = [(frozen_from, jump)] * (frozen_from < jump) + [      # first and last step
             (jump, k) for k in jumps if k > jump and t[k + 1] - t[jump] <= max_duration]
         for first, last in candidates:
             travel = counter_steps(value[[first, last + 1]], modulus)[0]    # exact, unlike sums
@@ -138,20 +153,20 @@ def _adjacent_rates(rate: Floats, first: int, last: int) -> tuple[float, float]:
 
 
 def with_gap_uncertainty(travel: Travel, value: Values,
-                         form: OdometerForm) -> tuple[Travel, Floats, Floats]:
+                         form: OdometerForm) -> tuple[Travel, UncertainTravel]:
     """
-    Return travel with interpolated gaps, and times (s) and sigmas of uncertain travel.
+    Return travel with interpolated gaps, and the uncertain travel.
 
     A counter measures the travel across gaps; it is uncertain only at resets, which ``travel``
     does not include.
     """
     if len(travel.t) < MIN_STEPS:
-        return travel, np.empty(0), np.empty(0)
+        return travel, CERTAIN
     dt, step = np.diff(travel.t), np.diff(travel.s)
     usual_dt = np.median(dt)
     rate = step / np.maximum(dt, usual_dt)
     if form.quantity == 'cumulative':
-        return travel, *_reset_uncertainty(travel, step, rate, counter_steps(value, form.modulus))
+        return travel, _reset_uncertainty(travel, step, rate, counter_steps(value, form.modulus))
     gaps = np.flatnonzero(dt > max(MISSING_INTERVALS * usual_dt, 0.2))
     before, after = np.array([_adjacent_rates(rate, k, k)
                               for k in gaps.tolist()]).reshape(-1, 2).T
@@ -172,12 +187,12 @@ def with_gap_uncertainty(travel: Travel, value: Values,
         travel = replace(travel, s=travel.s + running_sum(unpublished))
         times = np.r_[times, travel.t[rows]]
         sigma = np.r_[sigma, np.abs(unpublished[rows]) / 2]
-    return travel, times, sigma
+    return travel, UncertainTravel(times, sigma)
 
 
 def _reset_uncertainty(travel: Travel, step: Floats, rate: Floats,
-                       counts: Floats) -> tuple[Floats, Floats]:
-    """Return times, s, of resets of a counter and sigmas of the travel that is lost there."""
+                       counts: Floats) -> UncertainTravel:
+    """Return the travel that is lost at resets; counts : (n,) steps of the counter."""
     resets = np.flatnonzero(np.abs(np.abs(step) - np.abs(counts)) > 1e-6 * np.abs(counts) + 1e-9)
     # only the adjacent speeds bound the travel since the last count: uniform up to this limit
     limits = []
@@ -185,7 +200,7 @@ def _reset_uncertainty(travel: Travel, step: Floats, rate: Floats,
         first = _first_zero_step(step, k)
         speed = max(map(abs, _adjacent_rates(rate, first, k)))
         limits.append(speed * (travel.t[k + 1] - travel.t[first]))
-    return travel.t[resets], np.array(limits) / np.sqrt(3)
+    return UncertainTravel(travel.t[resets], np.array(limits) / np.sqrt(3))
 
 
 def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
@@ -203,7 +218,7 @@ def _travel_below_threshold(travel: Travel, value: Values) -> Floats:
         first, direction = (edge, -1) if stops else (edge + 1, 1)
         rows = first + direction * np.arange(ADJACENT_STEPS)
         rows = rows[(rows >= 0) & (rows < len(size))]
-        v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]
+        v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]      # m/s or rad/s
         duration = abs(travel.t[rows[-1]] - travel.t[rows[0]])
         if v > min_speed and change > 0 and duration > 0:
             counted = v * (travel.t[edge + 1] - travel.t[edge]) / 2

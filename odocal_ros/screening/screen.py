@@ -74,8 +74,7 @@ def screen(leg: Leg, config: Config,
         reasons += glitches.dead_band_reasons(t_imu, imu.w_i, wheels.mean)
         # one axle is only tested with an accelerometer
         if len(wheels.wheels) > (1 if inputs.has_accelerometer else len(SIDES)):
-            wheels, axle_reasons = usable_axles(
-                wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
+            wheels, axle_reasons = usable_axles(wheels, inputs.imu, (0.0, inputs.t_stop))
             reasons += axle_reasons
         inputs = replace(inputs, **_travel_fields(leg, wheels))
     release_mapped_memory()

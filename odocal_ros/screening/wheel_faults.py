@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, medians, runs
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.time_series import GAP_INTERVALS, integral_at, robust_sigma
+from odocal_ros.nav.time_series import GAP_INTERVALS, integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import ROLLING_SHARE
+from odocal_ros.screening.inputs import ImuRows
+from odocal_ros.screening.robust_fit import robust_fit, TUKEY
 from odocal_ros.settings.config import SIDES
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
-Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
-# robust sigmas beyond which a row has no weight; statistical: 95 % efficient on normal errors
-TUKEY = 4.685
 FAULT_CELL = 0.5          # s, judgement: duration of a cell
 STALLED_SHARE = 0.02      # judgement: share of the other wheel's travel; a stalled wheel has less
 OTHER_WHEEL_COUNTS = 8    # judgement: least counts of the other wheel during a stall
@@ -40,13 +39,13 @@ class WheelPair:
     left: NDArray[np.float64]     # (n,) scale units
     right: NDArray[np.float64]    # (n,) scale units
     turn: NDArray[np.float64]     # (n,) rad about the vehicle's up axis, with gyro bias
-    known: NDArray[np.bool_]      # (n - 1,) cells without a gap
-    quantum: float                # scale units
+    is_complete: NDArray[np.bool_]    # (n - 1,) False: a gap is in the cell
+    quantum: float                # scale units, step of the counters
     names: tuple[str, ...] = SIDES
 
     @property
-    def step(self) -> float:
-        """Return the length of a cell, s."""
+    def cell_s(self) -> float:
+        """Return the duration of a cell, s."""
         return float(self.t[1] - self.t[0])
 
     def min_sigma(self, steps: Floats) -> float:
@@ -54,13 +53,13 @@ class WheelPair:
         return 0.3 * self.quantum + 1e-4 * float(np.median(np.abs(steps)))
 
 
-def wheels_on_grid(axle: Sequence[Travel], imu: Imu, marks: tuple[float, float], step: float,
-                   uncertain_t: Sequence[float] | Floats = ()) -> WheelPair | None:
+def wheels_on_grid(axle: Sequence[Travel], imu: ImuRows, marks: tuple[float, float],
+                   cell_s: float, uncertain_t: Sequence[float] | Floats = ()) -> WheelPair | None:
     """
-    Return the wheels in cells of ``step`` s, None with fewer than 20 common cells.
+    Return the wheels in cells of ``cell_s`` s, None with fewer than 20 common cells.
 
-    imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   marks : start and stop, s.
-    uncertain_t : (d,) s, times of uncertain travel; cells next to them are not known.
+    axle : left and right wheel.   marks : start and stop, s.   uncertain_t : (d,) s, times of
+    uncertain travel; cells next to them are not complete.
     """
     t_imu, w_b, f_b = imu
     left, right = axle
@@ -68,76 +67,41 @@ def wheels_on_grid(axle: Sequence[Travel], imu: Imu, marks: tuple[float, float],
         return None
     begin = max(left.t[0], right.t[0], t_imu[0], marks[0])
     end = min(left.t[-1], right.t[-1], t_imu[-1], marks[1])
-    t = begin + step * np.arange(max(0, int((end - begin) / step) + 1))
+    t = begin + cell_s * np.arange(max(0, int((end - begin) / cell_s) + 1))
     if len(t) < 21:
         return None
     up_b = medians(f_b)          # the mean of gravity: roll and pitch of the mounting
     rate = w_b @ (up_b / max(float(np.linalg.norm(up_b)), 1e-9))
-    known = np.ones(len(t) - 1, bool)
+    is_complete = np.ones(len(t) - 1, bool)
     for times in (left.t, right.t, t_imu):
-        gap = np.diff(times)
-        for k in np.flatnonzero(gap > max(GAP_INTERVALS * np.median(gap), 0.2)):
-            known &= (t[1:] < times[k]) | (t[:-1] > times[k + 1])
+        interval = np.diff(times)
+        for k in np.flatnonzero(interval > max(GAP_INTERVALS * np.median(interval), 0.2)):
+            is_complete &= (t[1:] < times[k]) | (t[:-1] > times[k + 1])
     for time in uncertain_t:
-        known &= (t[1:] < time - step) | (t[:-1] > time + step)
-    return WheelPair(t, left.at(t), right.at(t), integral_at(t, t_imu, rate), known,
+        is_complete &= (t[1:] < time - cell_s) | (t[:-1] > time + cell_s)
+    return WheelPair(t, left.at(t), right.at(t), integral_at(t, t_imu, rate), is_complete,
                      max(left.quantum, right.quantum),
                      tuple(wheel.name or side for wheel, side in zip(axle, SIDES, strict=True)))
 
 
-def robust_fit(A: Floats, y: Floats, min_sigma: float,
-               prior: Sequence[float] | Floats | None = None,
-               start: Sequence[float] | Floats | None = None) -> tuple[Floats, Floats, float]:
-    """
-    Return x of y = A x by least squares with Tukey's weights, its covariance, and sigma of y.
-
-    A, y : (n, k), (n,) design and values.   min_sigma : least sigma of y.   prior : (k,) sigmas
-    of the coefficients about zero, inf: no prior.   start : (k,) coefficients that fit many rows;
-    default: least squares. The sigma of y is by the median of the residuals.
-    """
-    column_size = np.abs(A).max(axis=0)
-    column_size[column_size == 0] = 1.0
-    A = A / column_size
-    information = np.zeros(A.shape[1]) if prior is None else (
-        1 / (np.asarray(prior) * column_size)**2)
-    weight, sigma = np.ones(len(y)), 0.0
-    x = np.zeros(A.shape[1]) if start is None else np.asarray(start) * column_size
-    tukey_passes = 20
-    for k in range(tukey_passes):
-        if k or start is not None:
-            residual = y - A @ x
-            sigma = max(robust_sigma(residual), min_sigma)
-            u = residual / (TUKEY * sigma)
-            # absolute values first (Huber): without a start Tukey's weights can converge anywhere
-            huber = start is None and k < tukey_passes // 2
-            weight = 1 / np.maximum(1.0, 3 * np.abs(u)) if huber else np.where(
-                np.abs(u) < 1, (1 - u**2)**2, 0.0)
-        H = (A * weight[:, None]).T @ A + np.diag(
-            information * max(sigma, min_sigma)**2 + 1e-12 * len(y))
-        x = np.linalg.solve(H, A.T @ (weight * y))
-    covariance = np.linalg.inv(H) * sigma**2 / np.outer(column_size, column_size)
-    return x / column_size, covariance, sigma
-
-
-def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
+def broken_wheel_reasons(axle: Sequence[Travel], imu: ImuRows,
                          marks: tuple[float, float]) -> tuple[Reason, ...]:
     """
     Return WHEEL_DEAD and WHEEL_REVERSED, once each, if one wheel fails; () if both count.
 
-    axle : (2,) Travel of the left and the right wheel, scale units.   imu : (t, w_b, f_b)
-    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, with bias.   marks : start and stop, s.
+    axle : left and right wheel.   marks : start and stop, s.
     """
     pair = wheels_on_grid(axle, imu, marks, FAULT_CELL)
     if pair is None:
         return ()
-    steps = np.diff([pair.left, pair.right])          # (2, n)
-    rolled = np.abs(steps).sum(axis=1)
-    slower = int(np.argmin(rolled))
-    if rolled.max() <= OTHER_WHEEL_COUNTS * pair.quantum or rolled.max() == 0.0:
+    steps = np.diff([pair.left, pair.right])          # (2, n) travel in each cell
+    path = np.abs(steps).sum(axis=1)
+    slower = int(np.argmin(path))
+    if path.max() <= OTHER_WHEEL_COUNTS * pair.quantum or path.max() == 0.0:
         return ()                                   # the vehicle does not move
-    if rolled[slower] <= STALLED_SHARE * rolled.max():
+    if path[slower] <= STALLED_SHARE * path.max():
         return (Reason(Code.WHEEL_DEAD, f'the {pair.names[slower]} wheel does not count: its '
-                       f'travel is {percent_text(rolled[slower], rolled.max())} of that of the '
+                       f'travel is {percent_text(path[slower], path.max())} of that of the '
                        f'{pair.names[1 - slower]} wheel (limit {100 * STALLED_SHARE:g} %). The '
                        'mean of both wheels is not the travel of the vehicle'),)
     left, right = axle
@@ -147,11 +111,12 @@ def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
     stalled = [_stalled_cells(pair, steps, k) for k in (0, 1)]
     any_stalled = np.any(stalled, axis=0)
     turn = np.diff(pair.turn)
-    keep = pair.known & ~any_stalled & _rolling(steps, pair.quantum).any(axis=0)
-    if keep.sum() < 10:
+    use = pair.is_complete & ~any_stalled & _rolling(steps, pair.quantum).any(axis=0)
+    min_cells = 10    # of a fit of three coefficients
+    if use.sum() < min_cells:
         return _dead_reasons(pair, steps, stalled)
     design = np.stack([steps[0], turn, np.full(len(turn), FAULT_CELL)], -1)
-    x, covariance = _fit_right_wheel(design[keep], steps[1][keep], pair.min_sigma(steps))
+    x, covariance = _fit_right_wheel(design[use], steps[1][use], pair.min_sigma(steps))
     stalled = [_without_pivots(stalled[k], steps, design, x, k) for k in (0, 1)]
     return _dead_reasons(pair, steps, stalled) + _reversed_reasons(
         pair, steps, design @ x, x[0], covariance[0, 0], imu)
@@ -159,25 +124,25 @@ def broken_wheel_reasons(axle: Sequence[Travel], imu: Imu,
 
 def _fit_right_wheel(design: Floats, y: Floats, min_sigma: float) -> tuple[Floats, Floats]:
     """
-    Return the coefficients of left wheel, turn and time in the right wheel, and their covariance.
+    Return the three coefficients of the module docstring, and their covariance.
 
     design : (n, 3) travel of the left wheel, turn, rad, duration, s, of each cell.   y : (n,)
     travel of the right wheel.   min_sigma : least sigma of y. There are two robust fits,
     one of which starts without turns; the one with fewer outliers is used.
     """
     rolling = design[:, 0] != 0
-    usual = float(np.median(y[rolling] / design[rolling, 0])) if rolling.any() else 1.0
+    usual_ratio = float(np.median(y[rolling] / design[rolling, 0])) if rolling.any() else 1.0
     # 1 sigma of gyro bias times track width, over the top speed
     drift_share = 0.02
     drift = drift_share * float(np.percentile(np.abs(y), 95)) / FAULT_CELL
     fits = [robust_fit(design, y, min_sigma, (np.inf, np.inf, drift), start)
-            for start in (None, (usual, 0.0, 0.0))]
-    smallest = min(sigma for _, _, sigma in fits)
+            for start in (None, (usual_ratio, 0.0, 0.0))]
+    smallest_sigma = min(fit.sigma for fit in fits)
     # rad in a cell, noise of a vibrating consumer gyro: judgement. It allows larger residuals in
     # straights to a fit with turns than to one without
     gyro_noise = 2e-4
-    losses = [np.minimum(1.0, ((y - design @ x) / (
-        TUKEY * np.hypot(smallest, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
+    losses = [np.minimum(1.0, ((y - design @ x) / (      # squared residuals, 1 for an outlier
+        TUKEY * np.hypot(smallest_sigma, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
     return fits[int(np.argmin(losses))][:2]
 
 
@@ -191,7 +156,7 @@ def _stalled_cells(pair: WheelPair, steps: Floats, k: int) -> Bools:
     """Return a mask of cells in which wheel k is still for 2 s or more while the other rolls."""
     this_wheel, other = np.abs(steps[k]), np.abs(steps[1 - k])
     other_rolls = _rolling(steps, pair.quantum)[1 - k]
-    still: Bools = pair.known & (this_wheel <= STALLED_SHARE * other) & other_rolls
+    still: Bools = pair.is_complete & (this_wheel <= STALLED_SHARE * other) & other_rolls
     shortest_stall = 2.0    # s without a count while the other wheel rolls; shorter is slip
     for begin, end in runs(still):
         if ((end - begin) * FAULT_CELL < shortest_stall
@@ -225,7 +190,6 @@ def _dead_reasons(pair: WheelPair, steps: Floats, stalled: list[Bools]) -> tuple
         return ()
     first, last = spans[0][0], spans[-1][1]
     other = np.abs(steps[1 - k])
-    lost = other[stalled[k]].sum()
 
     def is_dead_from(cell: int) -> bool:
         other_travel: float = other[cell:].sum()
@@ -235,13 +199,14 @@ def _dead_reasons(pair: WheelPair, steps: Floats, stalled: list[Bools]) -> tuple
         when = f'from t = {begin:.1f} s on'
     else:
         several = len(spans) > 1
-        when = f'{len(spans)} time{"s" * several}, first from t = {begin:.1f} s for ' \
+        when = f'in {len(spans)} interval{"s" * several}, first from t = {begin:.1f} s for ' \
                f'{(spans[0][1] - first) * FAULT_CELL:.1f} s'
         if several and is_dead_from(last):
             when += f', last from t = {pair.t[spans[-1][0]]:.1f} s on'
     return (Reason(Code.WHEEL_DEAD, f'the {pair.names[k]} wheel does not count {when}, in '
-                   f'{percent_text(lost, other.sum())} of the travel of the {pair.names[1 - k]} '
-                   'wheel: the mean of both wheels is not the travel of the vehicle'),)
+                   f'{percent_text(other[stalled[k]].sum(), other.sum())} of the travel of the '
+                   f'{pair.names[1 - k]} wheel: the mean of both wheels is not the travel of the '
+                   'vehicle'),)
 
 
 def percent_text(part: float, total: float) -> str:
@@ -250,14 +215,15 @@ def percent_text(part: float, total: float) -> str:
 
 
 def _reversed_reasons(pair: WheelPair, steps: Floats, expected: Floats, ratio: float,
-                      variance: float, imu: Imu) -> tuple[Reason, ...]:
+                      variance: float, imu: ImuRows) -> tuple[Reason, ...]:
     """
     Return WHEEL_REVERSED if the right wheel contradicts left wheel and gyro.
 
     expected : (n,) travel of the right wheel by the fit.   ratio, variance : coefficient of the
     left wheel.
     """
-    if ratio < -FAULT_SIGMAS * np.sqrt(variance) and ratio < -0.1:
+    highest_ratio = -0.1    # of a reversed wheel: far from 0, whatever the sigma
+    if ratio < min(-FAULT_SIGMAS * np.sqrt(variance), highest_ratio):
         k = _wheel_against_imu(pair, steps, imu)
         text = (f'the {pair.names[k]} wheel counts down when the vehicle drives forward, the '
                 f'{pair.names[1 - k]} wheel counts up' if k is not None else
@@ -266,7 +232,8 @@ def _reversed_reasons(pair: WheelPair, steps: Floats, expected: Floats, ratio: f
         return (Reason(Code.WHEEL_REVERSED, f'{text}: the mean of both wheels is not the travel '
                        'of the vehicle'),)
     rolling = _rolling(np.stack([expected, steps[1]]), pair.quantum).all(axis=0)
-    is_opposite = pair.known & rolling & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0)
+    is_opposite = (pair.is_complete & rolling
+                   & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0))
     min_duration = 1.5    # s of counting opposite to the other wheel
     spans = [(begin, end) for begin, end in runs(is_opposite)
              if (end - begin) * FAULT_CELL >= min_duration]
@@ -282,10 +249,9 @@ def _reversed_reasons(pair: WheelPair, steps: Floats, expected: Floats, ratio: f
                    f'first at t = {pair.t[begin]:.1f} s for {(end - begin) * FAULT_CELL:.1f} s'),)
 
 
-def _wheel_against_imu(pair: WheelPair, steps: Floats, imu: Imu) -> int | None:
+def _wheel_against_imu(pair: WheelPair, steps: Floats, imu: ImuRows) -> int | None:
     """Return the wheel that accelerates opposite to the IMU's x axis, None if uncertain."""
-    t_imu, _, f_b = imu
-    acceleration = np.diff(integral_at((pair.t[:-1] + pair.t[1:]) / 2, t_imu, f_b[:, 0]))
+    acceleration = np.diff(integral_at((pair.t[:-1] + pair.t[1:]) / 2, imu.t, imu.f_b[:, 0]))
     acceleration = acceleration - np.median(acceleration)
     score = [_correlation(np.diff(step), acceleration) for step in steps]
     if score[0] * score[1] < 0 and min(np.abs(score)) > FAULT_SIGMAS:

@@ -12,7 +12,7 @@ of the same size: the modulus.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,22 +25,13 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import odometer_rows
 from odocal_ros.screening.inputs import UsableRows
 from odocal_ros.screening.late_rows import sampling_times
+from odocal_ros.screening.odometer_rows import CERTAIN, UncertainTravel
 from odocal_ros.settings.config import Config
 
 # known moduli of integer counts, and of angles in rad or deg
 KNOWN_MODULI = {'integer': 2.0 ** np.arange(6, 54),
                 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
 NAMED_MODULI = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
-
-
-class UncertainTravel(NamedTuple):
-    """Times at which travel is uncertain."""
-
-    t: Floats        # (k,) s
-    sigma: Floats    # (k,) scale units
-
-
-CERTAIN = UncertainTravel(np.empty(0), np.empty(0))    # definition: no uncertain travel
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +49,13 @@ def find_rollovers(value: Values, step: Floats) -> Rollovers | None:
     if len(step) < MIN_STEPS or not step.any():
         return None
     is_integer = np.issubdtype(value.dtype, np.integer)
-    usual = _usual_steps(step)
-    rows = _jump_rows(step, usual, is_integer)
+    usual_step = _usual_steps(step)
+    rows = _jump_rows(step, usual_step, is_integer)
     if not len(rows):
         return None
-    size = np.abs(step - usual)[rows]
-    tolerance = np.abs(usual[rows]) / 2 + (3.0 if is_integer else 1e-3 * size)
+    size = np.abs(step - usual_step)[rows]
+    # of a jump: half a step, and counts, or rounding of an angle
+    tolerance = np.abs(usual_step[rows]) / 2 + (3.0 if is_integer else 1e-3 * size)
     estimate = _estimate_modulus(value, rows, float(np.median(size)), float(np.median(tolerance)))
     if estimate is None:
         return None
@@ -76,7 +68,7 @@ def find_rollovers(value: Values, step: Floats) -> Rollovers | None:
     # a larger range: likely rows out of order, or two counters
     if _value_range(value, rows) > modulus + np.median(tolerance):
         return None
-    return Rollovers(modulus, sigma, rows, -np.sign((step - usual)[rows]).astype(np.int64))
+    return Rollovers(modulus, sigma, rows, -np.sign((step - usual_step)[rows]).astype(np.int64))
 
 
 def _usual_steps(step: Floats) -> Floats:
@@ -87,15 +79,15 @@ def _usual_steps(step: Floats) -> Floats:
         np.lib.stride_tricks.sliding_window_view(padded, 2 * side_steps + 1), axis=-1))
 
 
-def _jump_rows(step: Floats, usual: Floats, is_integer: bool) -> Ints:
+def _jump_rows(step: Floats, usual_step: Floats, is_integer: bool) -> Ints:
     """Return the rows before jumps against the travel, relative to the usual step: (k,)."""
-    jump = step - usual
-    largest_usual = float(np.percentile(np.abs(usual), 99.9))
+    jump = step - usual_step
+    largest_usual = float(np.percentile(np.abs(usual_step), 99.9))
     min_jump = 8.0    # counts
-    is_large = np.abs(jump) > np.maximum(2 * np.abs(usual) + min_jump * is_integer,
+    is_large = np.abs(jump) > np.maximum(2 * np.abs(usual_step) + min_jump * is_integer,
                                          1.5 * largest_usual)
     # only against the travel: a frozen counter catches up with a jump along it
-    return np.flatnonzero(is_large & (jump * usual <= 0))
+    return np.flatnonzero(is_large & (jump * usual_step <= 0))
 
 
 def _estimate_modulus(value: Values, rows: Ints, size: float,
@@ -118,7 +110,7 @@ def _estimate_modulus(value: Values, rows: Ints, size: float,
     if not is_integer:
         return size, tolerance / np.sqrt(3 * len(rows))
     modulus, sigma = _roundest_modulus(value, rows, size, tolerance)
-    return (modulus, sigma) if modulus <= moduli[-1] else None    # wider: values are damaged
+    return (modulus, sigma) if modulus <= moduli[-1] else None    # larger: values are damaged
 
 
 def _value_range(value: Values, rows: Ints) -> float:
@@ -128,7 +120,11 @@ def _value_range(value: Values, rows: Ints) -> float:
 
 def _roundest_modulus(value: Values, rows: Ints, size: float,
                       tolerance: float) -> tuple[float, float]:
-    """Return the roundest possible modulus, and its sigma; as ``_estimate_modulus``."""
+    """
+    Return the modulus and its sigma; as ``_estimate_modulus``.
+
+    Of the possible values it is a multiple of the largest power of ten; without any, their middle.
+    """
     low = _value_range(value, rows) + 1
     high = max(low, size + 2 * tolerance / np.sqrt(len(rows)))
     for unit in (1e6, 1e5, 1e4, 1e3, 1e2):
@@ -148,38 +144,37 @@ def correct_rollovers(
     of the message type's range corrected.   name : of the counter, in reasons.   only_counter :
     the vehicle has no other one.
     """
-    found = find_rollovers(samples.value, step)
-    if found is None:
+    rollovers = find_rollovers(samples.value, step)
+    if rollovers is None:
         return samples, (), CERTAIN
     direction = np.zeros(len(t), np.int64)
-    direction[found.rows + 1] = found.direction
+    direction[rollovers.rows + 1] = rollovers.direction
     is_integer = np.issubdtype(samples.value.dtype, np.integer)
-    modulus = round(found.modulus) if is_integer else found.modulus
+    modulus = round(rollovers.modulus) if is_integer else rollovers.modulus
     value: NDArray[Any] = samples.value + modulus * np.cumsum(direction)
     # one error of the modulus for all jumps; the budget treats uncertainties as independent
-    count = len(found.rows)
-    uncertain = UncertainTravel(
-        t[found.rows], np.full(count, found.sigma * np.sqrt(count))) if found.sigma else CERTAIN
+    sigma = rollovers.sigma * np.sqrt(len(rollovers.rows))
+    uncertain = UncertainTravel(t[rollovers.rows],
+                                np.full(len(rollovers.rows), sigma)) if sigma else CERTAIN
     return (replace(samples, value=value),
-            (_rollover_reason(found, t, name, only_counter),), uncertain)
+            (_rollover_reason(rollovers, t, name, only_counter),), uncertain)
 
 
-def _rollover_reason(found: Rollovers, t: Floats, name: str, only_counter: bool) -> Reason:
+def _rollover_reason(rollovers: Rollovers, t: Floats, name: str, only_counter: bool) -> Reason:
     """Return the reason that reports rollovers; arguments as for ``correct_rollovers``."""
-    times, modulus = len(found.rows), f'{found.modulus:.0f}'
-    about = f'about {modulus} (± {found.sigma:.0f})' if found.sigma else NAMED_MODULI.get(
-        found.modulus, modulus)
-    angle = found.modulus in NAMED_MODULI     # exact, but odometer.wrap needs an integer
-    code = Code.COUNTER_ROLLOVER if only_counter or angle else Code.WHEEL_COUNTERS_DIFFER
-    remedy = '' if angle else f'Set odometer.wrap to {modulus}.' if only_counter else (
+    count, modulus = len(rollovers.rows), f'{rollovers.modulus:.0f}'
+    is_angle = rollovers.modulus in NAMED_MODULI     # exact, but odometer.wrap needs an integer
+    stated = NAMED_MODULI[rollovers.modulus] if is_angle else (
+        f'about {modulus} (± {rollovers.sigma:.0f})' if rollovers.sigma else modulus)
+    code = Code.COUNTER_ROLLOVER if only_counter or is_angle else Code.WHEEL_COUNTERS_DIFFER
+    remedy = '' if is_angle else f'Set odometer.wrap to {modulus}.' if only_counter else (
         f'If both wheels have this modulus, set odometer.wrap to {modulus}. Otherwise '
         'correct the driver: odometer.wrap is for both.')
-    # judgement: few counters roll over so often; values of two counters alternate
-    two_publishers = times > 0.1 * (len(t) - 1)
-    text = (f'{name} rolls over at {about}, below the range of its message type; {times} '
-            f'jump{"s" * (times > 1)} of this size opposite to the travel, first at t = '
-            f'{t[found.rows[0] + 1]:.2f} s, removed from the travel')
-    if two_publishers:
+    text = (f'{name} rolls over at {stated}, below the range of its message type; {count} '
+            f'jump{"s" * (count > 1)} of this size opposite to the travel, first at t = '
+            f'{t[rollovers.rows[0] + 1]:.2f} s, removed from the travel')
+    max_share = 0.1    # of the rows: few counters roll over so often; values of two alternate
+    if count > max_share * (len(t) - 1):
         text += ('. Check for two publishers on the topic if the counter cannot roll over so '
                  'often')
     return Reason(code, text, remedy)
@@ -256,8 +251,7 @@ def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, c
     """Return the travel of a wheel, its uncertain travel, and reasons."""
     name = f"the {side} wheel's counter" if side else 'the counter'
     odometer = f'{side} odometer'.strip()
-    uncertain = CERTAIN
-    reasons: list[Reason] = []
+    uncertain, reasons = CERTAIN, list[Reason]()
     if form.quantity == 'cumulative':
         step = odometer_rows.counter_steps(samples.value, form.modulus)
         samples, rollover_reasons, uncertain = correct_rollovers(
@@ -266,9 +260,9 @@ def _corrected_travel(samples: OdometerSamples, t: Floats, form: OdometerForm, c
     samples, t, false_reasons = odometer_rows.without_false_rows(samples, t, form, odometer)
     t, late_reasons = sampling_times(samples, t, form, odometer)
     travel, reset_reasons = make_travel(t, samples.value, form, config.odometer.reversed, name)
-    travel, gap_t, gap_sigma = odometer_rows.with_gap_uncertainty(travel, samples.value, form)
+    travel, in_gaps = odometer_rows.with_gap_uncertainty(travel, samples.value, form)
     return (replace(travel, name=side),
-            UncertainTravel(np.append(uncertain.t, gap_t), np.append(uncertain.sigma, gap_sigma)),
+            UncertainTravel(*map(np.append, uncertain, in_gaps)),
             [*reasons, *false_reasons, *late_reasons, *reset_reasons])
 
 

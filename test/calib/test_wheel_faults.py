@@ -40,9 +40,8 @@ def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=pre
     inputs, track, latitude, metres = prepare(**options)
     wheels = [replace(w, s=change(w.s)) for w, change in (
         (inputs.travels[0], left), (inputs.travels[1], right))]
-    imu = inputs.t_imu, inputs.w_b, inputs.f_b
     reasons, slips = wheel_faults(
-        wheels[::-1 if swap else 1], imu, (0.0, inputs.t_stop), track, latitude,
+        wheels[::-1 if swap else 1], inputs.imu, (0.0, inputs.t_stop), track, latitude,
         more.pop('rough', 1.0) * metres, **more)
     return tuple(r for r in reasons if r.code not in also), slips
 

@@ -211,7 +211,7 @@ BAND = 0.25
 def test_travel_lost_in_a_dead_band_is_restored_with_an_uncertainty(reversed_counts):
     zeroed = np.where(np.abs(BOTH_DIRECTIONS) < BAND, 0.0, BOTH_DIRECTIONS)
     raw, _ = make_travel(AT, zeroed, RATE, reversed_counts=reversed_counts)
-    path, t, sigma = with_gap_uncertainty(raw, zeroed, RATE)
+    path, (t, sigma) = with_gap_uncertainty(raw, zeroed, RATE)
     true, _ = make_travel(AT, BOTH_DIRECTIONS, RATE, reversed_counts=reversed_counts)
     lost = np.abs(np.diff(raw.s)).sum() - np.abs(np.diff(true.s)).sum()
     left = np.abs(np.diff(path.s)).sum() - np.abs(np.diff(true.s)).sum()
@@ -226,7 +226,7 @@ def test_travel_lost_in_a_dead_band_is_restored_with_an_uncertainty(reversed_cou
 
 def test_a_speed_without_a_dead_band_is_unchanged():
     exact, _ = make_travel(AT, BOTH_DIRECTIONS, RATE)
-    path, t, _ = with_gap_uncertainty(exact, BOTH_DIRECTIONS, RATE)
+    path, (t, _) = with_gap_uncertainty(exact, BOTH_DIRECTIONS, RATE)
     np.testing.assert_array_equal(path.s, exact.s)
     assert not len(t)
 

@@ -11,6 +11,7 @@ import pytest
 
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code
+from odocal_ros.screening.inputs import ImuRows
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.wheel_faults import broken_wheel_reasons
 
@@ -66,7 +67,7 @@ def test_a_wheel_that_stops_for_seconds_is_reported_with_time_and_length():
         value[b:] -= value[b] - value[a]
         value[a:b] = value[a]
     text = texts_of(made, odometer_right=hangs)[Code.WHEEL_DEAD]
-    assert 'right wheel does not count 1 time, first from t = ' in text
+    assert 'right wheel does not count in 1 interval, first from t = ' in text
     begin, length = (float(text.split(x)[1].split()[0]) for x in ('t = ', ' s for '))
     assert abs(begin - t[a]) < 1.1
     assert abs(length - 4.0) < 1.1
@@ -80,14 +81,14 @@ def robot(right_speed, left_speed, track=0.5, seconds_=200.0):
     turn = (right - left) / track
     w = np.stack([0 * t, 0 * t, np.gradient(turn, t) + 0.01], -1)
     f = np.stack([np.gradient(np.gradient((left + right) / 2, t), t), 0 * t, 0 * t + 9.8], -1)
-    return [Travel(t, np.floor(w_ / 0.001), 1.0) for w_ in (left, right)], (t, w, f)
+    return [Travel(t, np.floor(w_ / 0.001), 1.0) for w_ in (left, right)], ImuRows(t, w, f)
 
 
 def test_a_robot_may_turn_about_one_wheel_and_on_the_spot():
     wheels, imu = robot(right_speed=[0.5, 0.5, 0.3, 0.6], left_speed=[0.5, 0.0, -0.3, 0.6])
     assert broken_wheel_reasons(wheels, imu, (0.0, 200.0)) == ()
     # the same wheels with zero turn rate: one dead for a while, and opposite directions
-    still = (imu[0], imu[1] * 0, imu[2])
+    still = imu._replace(w_b=imu.w_b * 0)
     codes = {r.code for r in broken_wheel_reasons(wheels, still, (0.0, 200.0))}
     assert codes == {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
