@@ -4,8 +4,8 @@
 """
 The data set of a fleet: one small Parquet file per bag, written atomically.
 
-rows/ab/<key>.parquet: the key is a hash of the bag's content, the settings that affect its legs
-and the software version; for a failed bag, of its path instead of its content.
+rows/ab/<key>.parquet: the key is a hash of the bag's content, the settings that affect its legs,
+the software version and its stored types; for a failed bag, of its path instead of its content.
 seen/ab/<fingerprint> contains the key of a row; the fingerprint is a hash of path, size and date
 of the bag, so that known bags are not read again. ab are the first letters of the hash.
 """
@@ -62,10 +62,23 @@ class Row:
         """Return all settings of the bag."""
         return with_settings(Config(), json.loads(self.settings))
 
+    def leg_results(self) -> list[result.LegResult]:
+        """Return the legs of the bag; raise BadData if another version wrote them."""
+        try:
+            return list(json.loads(self.legs, object_hook=_from_json))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise BadData(f'{self.bag}: this version cannot read the stored legs '
+                          f'({type(error).__name__}: {error_text(error)}); remove the file '
+                          f'rows/{self.key[:2]}/{self.key}.parquet in the output folder and '
+                          'repeat the command') from None
+
 
 def key_of(*parts: Any) -> str:
-    """Return a hash of the software version and the parts."""
-    return hashlib.sha256(json.dumps([__version__, *parts]).encode()).hexdigest()[:40]
+    """Return a hash of the software version, of what a row can hold, and of the parts."""
+    # a version under development may remove a reason code or a field of a result
+    types = {name: [field.name for field in fields(kind)] for name, kind in STORED_TYPES.items()}
+    return hashlib.sha256(json.dumps(
+        [__version__, types, list(Code.__members__), *parts]).encode()).hexdigest()[:40]
 
 
 def changed_settings(config: Config) -> dict[str, Any]:
@@ -172,12 +185,6 @@ TYPE_KEY = '~'      # the key of an object's type
 def text_of_legs(legs: list[result.LegResult]) -> str:
     """Return legs as JSON, without the rows that only a report draws."""
     return json.dumps([_to_json(leg.without_plot_data()) for leg in legs], separators=(',', ':'))
-
-
-def legs_from_text(text: str) -> list[result.LegResult]:
-    """Return the legs of ``text_of_legs``."""
-    legs: list[result.LegResult] = json.loads(text, object_hook=_from_json)
-    return legs
 
 
 def _to_json(value: Any) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
-from odocal_ros.fleet.rows import legs_from_text, Row
+from odocal_ros.fleet.rows import Row
 from odocal_ros.fleet.statistics import MODEL_OUTLIER_SIGMAS, population
 from odocal_ros.output.value_text import MAIN_VALUES, UNKNOWN
 from odocal_ros.safe_io.atomic_files import locked, whole_file
@@ -52,7 +52,7 @@ def table_rows(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
     """Return the legs of a bag's row as rows of a table; for a failed bag, one without values."""
     bag_cells = {'status': row.status, 'reason': row.reason}
     return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | bag_cells
-            for k, leg in enumerate(legs_from_text(row.legs), 1)] or [
+            for k, leg in enumerate(row.leg_results(), 1)] or [
         {'vehicle': bag.vehicle, 'model': bag.model, 'bag': one_line(row.bag), **bag_cells}]
 
 

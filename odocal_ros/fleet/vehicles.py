@@ -16,7 +16,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.combine import DIFFERING_SOURCES
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
-from odocal_ros.fleet.rows import DONE, legs_from_text, read_rows, Row
+from odocal_ros.fleet.rows import DONE, read_rows, Row
 from odocal_ros.fleet.statistics import covariance, History, history
 from odocal_ros.fleet.tables import leg_row, utc, value_cells
 from odocal_ros.library.calibrate_bag import unique_names
@@ -43,7 +43,7 @@ class DrivenLeg(NamedTuple):
 
 def legs_by_time(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenLeg]:
     """Return the legs of rows by time, with unique bag names as in replay; bags : by path."""
-    legs = [legs_from_text(row.legs) for row in rows]
+    legs = [row.leg_results() for row in rows]
     entries = [{'bag': next((leg.bag for leg in bag_legs), row.bag)}
                for row, bag_legs in zip(rows, legs, strict=True)]
     with_names, _ = unique_names([Path(row.bag) for row in rows], legs, entries)

@@ -3,6 +3,7 @@
 
 """Selection of bags: manifests, folders, globs, patterns, URLs; and legs stored as text."""
 
+from enum import Enum
 import shutil
 import zipfile
 
@@ -10,13 +11,15 @@ from drives import drive, settings
 import pytest
 
 from odocal_ros.errors import BadBag, BadData, BadUsage
-from odocal_ros.fleet import bags as bags_module
+from odocal_ros.fleet import bags as bags_module, rows as rows_module
 from odocal_ros.fleet.bags import bag_fingerprint, find_bags, FleetBag, local_copy
-from odocal_ros.fleet.rows import key_of, legs_from_text, read_rows, Row, RowStore, text_of_legs
+from odocal_ros.fleet.rows import key_of, read_rows, Row, RowStore, text_of_legs
 from odocal_ros.fleet.tables import folder_name
+from odocal_ros.fleet.vehicles import vehicle_of, VehicleJob
 from odocal_ros.offline.cli import main
 from odocal_ros.output.files import as_json
 from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.reasons import Code
 
 pytestmark = pytest.mark.core
 pytest.importorskip('fsspec')
@@ -127,7 +130,26 @@ def test_a_truncated_row_is_computed_again(tmp_path, spoil):
         assert store.find_key('ab' * 20) is None
 
 
-def test_legs_from_text_combine_to_the_same_digits():
+@pytest.mark.parametrize(('legs', 'what'), [
+    ('[{"~": "Code", "of": "PLANES_DISAGREE"}]', 'PLANES_DISAGREE'),
+    ('[{"~": "Plane"}]', 'Plane'), ('[{"~": "Reason", "plane": 1}]', 'plane'), ('[', 'line 1')])
+def test_legs_of_another_version_are_refused_with_the_file_to_remove(legs, what, tmp_path):
+    store, key = RowStore(tmp_path), key_of('a bag')
+    store.put(Row(key=key, bag='drive', vehicle='7', legs=legs))
+    job = VehicleJob('7', (FleetBag('7', 'drive'),), (str(store.path(key)),))
+    with pytest.raises(BadData, match=f'drive: .*{what}.*remove the file rows/{key[:2]}/{key}'):
+        vehicle_of(job)
+
+
+def test_a_bag_has_another_key_when_reason_codes_or_results_change(monkeypatch):
+    before = key_of('a bag')
+    monkeypatch.setattr(rows_module, 'Code', Enum('Code', [*Code.__members__, 'PLANES_DISAGREE']))
+    changed_codes = key_of('a bag')
+    monkeypatch.setitem(rows_module.STORED_TYPES, 'Reason', rows_module.Row)
+    assert len({before, changed_codes, key_of('a bag')}) == 3
+
+
+def test_legs_of_a_row_combine_to_the_same_digits():
     """Also of the smoother, whose legs are combined by their shared constants."""
     legs = []
     for seed in (1, 2):
@@ -136,7 +158,7 @@ def test_legs_from_text_combine_to_the_same_digits():
         config = settings(made, heading_sigma=None, method='auto')
         legs.append(calibrate(made.leg(), config))
     text = text_of_legs(legs)
-    again = legs_from_text(text)
+    again = Row(key='', bag='', vehicle='', legs=text).leg_results()
     assert text_of_legs(again) == text
     kept = [leg.without_plot_data() for leg in legs]      # without data for the plots
     found, known = (as_json(combine(some, config), config, [], '') for some in (again, kept))
