@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Jobs of a fleet, one for each bag: their settings, submission, and the row of a worker."""
+"""
+Jobs of a fleet, one for each bag: making them, computing them on workers, storing their rows.
+
+A job that fails, takes too long or ends its worker gets a row with the cause.
+"""
 
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +32,7 @@ from odocal_ros.fleet.bags import bag_fingerprint, file_system, FleetBag, is_loc
 from odocal_ros.fleet.engine import task_results
 from odocal_ros.safe_io.text_formats import error_text
 
-# texts of other errors caused by a lack of memory: for the stack of a thread, or for a library
+# in texts of errors of other types that a lack of memory causes: no stack for a thread, no library
 NO_MEMORY = ("can't start new thread", 'failed to map segment')
 
 
@@ -232,18 +236,19 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, time_limit
 
 
 def computed_rows(client: Any, jobs: Sequence[BagJob],
-                  again: bool = False) -> Iterator[tuple[int, BagOutcome]]:
-    """Yield (index of the job, outcome) as jobs end; ``again``: retry failed bags."""
+                  retry_failed: bool = False) -> Iterator[tuple[int, BagOutcome]]:
+    """Yield (index of the job, outcome) as jobs end; the row of each is then stored."""
     store = rows.RowStore(jobs[0].folder)
     missing = []      # indices of jobs without a row
     for i, job in enumerate(jobs):
         if (key := _existing_key(store, job)) is None:
             missing.append(i)
-            if again:
+            if retry_failed:
                 store.drop(job.failed_key)
         else:
             yield i, BagOutcome(key, rows.DONE, False)
     submitted = [jobs[i] for i in missing]
+    # random: Dask keeps the result of a task of the same key
     keys = [f'{job.failed_key}-{os.urandom(4).hex()}' for job in submitted]
     for k, outcome, error in task_results(client, calibrate_bag, submitted, 'bag', keys):
         if error is not None:      # the worker was ended each time, or could not write
@@ -255,8 +260,8 @@ def computed_rows(client: Any, jobs: Sequence[BagJob],
 
 
 def _existing_key(store: rows.RowStore, job: BagJob) -> str | None:
-    """Return the key of the row of an unchanged bag on this machine, None without one."""
-    if not is_local(job.bag.bag):      # the worker contacts servers: they may not answer
+    """Return the key of the row of an unchanged local bag, None without one."""
+    if not is_local(job.bag.bag):      # only workers contact servers, which may not answer
         return None
     try:
         return store.find_key(bag_fingerprint(job.bag.bag, job.settings))

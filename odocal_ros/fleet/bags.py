@@ -19,6 +19,8 @@ from odocal_ros.safe_io.text_formats import error_text
 COLUMNS = ('vehicle', 'bag', 'config', 'legs', 'model', 'odometer_km')      # of a manifest
 ENDINGS = ('.mcap', '.db3', '.bag')
 METADATA = 'metadata.yaml'       # in the folder of a rosbag2
+PATTERN_REMEDY = ("required: a regular expression with a group for the vehicle's name, such as "
+                  "'fleet/(?P<vehicle>[^/]+)/'")
 
 
 @dataclass(frozen=True)
@@ -37,9 +39,9 @@ def find_bags(names: list[str], vehicle_from: str | None) -> list[FleetBag]:
     """
     Return the bags of a manifest, or in folders, globs and URLs.
 
-    vehicle_from : pattern (re) searched in a bag's path: its group ``vehicle``, else its first
-    one, names the vehicle; groups ``model`` and ``odometer_km`` likewise. None: the bag's folder
-    names it.
+    vehicle_from : regular expression that is searched in the path of a bag. Its group ``vehicle``,
+    else its first group, is the name of the vehicle; groups ``model`` and ``odometer_km`` are
+    optional. None: the name of the bag's folder is that of the vehicle.
 
     Raises BadUsage: a manifest cannot be read, nothing is found, or the pattern does not match a
     path.
@@ -59,12 +61,9 @@ def _pattern(text: str) -> re.Pattern[str]:
     try:
         pattern = re.compile(text)
     except re.error as error:
-        raise BadUsage(f'--vehicle-from {text}: {error}; required: a regular expression with a '
-                       'group, such '
-                       "as 'fleet/(?P<vehicle>[^/]+)/'") from None
+        raise BadUsage(f'--vehicle-from {text}: {error}; {PATTERN_REMEDY}') from None
     if not pattern.groups:
-        raise BadUsage(f"--vehicle-from {text}: it has no group; mark the vehicle's name, such "
-                       "as 'fleet/(?P<vehicle>[^/]+)/'")
+        raise BadUsage(f'--vehicle-from {text}: it has no group; {PATTERN_REMEDY}')
     return pattern
 
 
@@ -73,19 +72,21 @@ def _bag_of_path(bag: str, pattern: re.Pattern[str] | None) -> FleetBag:
         return FleetBag(PurePosixPath(bag).parent.name, bag)
     match = pattern.search(bag)
     if match is None:
-        raise BadUsage(f'--vehicle-from {pattern.pattern}: does not match {bag}')
+        raise BadUsage(f'--vehicle-from {pattern.pattern}: it does not match the path {bag}; '
+                       'change the pattern, or give a manifest')
     groups = match.groupdict()
     return FleetBag(groups.get('vehicle') or match[1] or '', bag, groups.get('model') or '',
-                    _number(groups.get('odometer_km'), bag))
+                    _odometer_km(groups.get('odometer_km'), bag))
 
 
-def _number(value: Any, where: str) -> float | None:
+def _odometer_km(value: Any, origin: str) -> float | None:
+    """Return a reading in km, None if it is missing (None, empty or NaN)."""
     if value in (None, '') or value != value:
         return None
     try:
         return float(value)
     except ValueError:
-        raise BadUsage(f'{where}: odometer_km {value!r} is not a number') from None
+        raise BadUsage(f'{origin}: odometer_km {value!r} is not a number') from None
 
 
 def _read_manifest(name: str) -> list[FleetBag]:
@@ -106,25 +107,26 @@ def _read_manifest(name: str) -> list[FleetBag]:
         raise BadUsage(f'{name}: cannot be read as a manifest ({error_text(error)})') from None
     missing = {'vehicle', 'bag'} - set(table.column_names)
     if missing or not table.num_rows:
-        fault = f'no column {" and ".join(sorted(missing))}' if missing else 'holds no bag'
+        fault = f'no column {" and ".join(sorted(missing))}' if missing else 'it has no bag'
         raise BadUsage(f'{name}: {fault}; '
                        f'required columns: vehicle, bag; optional: {", ".join(COLUMNS[2:])}')
-    known = [column for column in COLUMNS if column in table.column_names]
+    columns = [column for column in COLUMNS if column in table.column_names]
     root = name[:len(name) - len(PurePosixPath(name).name)]
     bags = []
-    for number, row in enumerate(table.select(known).to_pylist(), 2):
+    for number, row in enumerate(table.select(columns).to_pylist(), 2):
         cells = {column: str(value) for column, value in row.items() if value is not None}
         if not (cells.get('vehicle') and cells.get('bag')):
             raise BadUsage(f'{name}, row {number}: vehicle or bag is empty')
         bags.append(FleetBag(
             cells['vehicle'], _resolve_path(root, cells['bag']), cells.get('model', ''),
-            _number(cells.get('odometer_km'), f'{name}, row {number}'),
+            _odometer_km(cells.get('odometer_km'), f'{name}, row {number}'),
             _resolve_path(root, cells['config']) if cells.get('config') else '',
             tuple(cells.get('legs', '').split())))
     return bags
 
 
 def _resolve_path(root: str, path: str) -> str:
+    """Return a path or URL; a relative path is in the folder ``root``, which ends with /."""
     return path if '://' in path or path.startswith('/') else root + path
 
 
@@ -143,7 +145,7 @@ def _bags_in(name: str) -> list[str]:
     fs, path = file_system(name)
     try:
         paths = fs.glob(path) if any(character in path for character in '*?[') else [path]
-        bags = [bag for one_path in sorted(paths) for bag in _bags_in_folder(fs, one_path)]
+        bags = [bag for match in sorted(paths) for bag in _bags_in_folder(fs, match)]
         return [str(fs.unstrip_protocol(bag)) for bag in bags] if '://' in name else bags
     except OSError as error:
         raise BadUsage(f'{name}: cannot be read ({error_text(error)})') from None
@@ -157,9 +159,9 @@ def _bags_in_folder(fs: Any, path: str) -> list[str]:
         return [path]
     files = fs.find(path)
     folders = {str(PurePosixPath(f).parent) for f in files if PurePosixPath(f).name == METADATA}
-    single = [f for f in files
-              if f.endswith(ENDINGS) and str(PurePosixPath(f).parent) not in folders]
-    return sorted([*folders, *single])
+    single_files = [f for f in files
+                    if f.endswith(ENDINGS) and str(PurePosixPath(f).parent) not in folders]
+    return sorted([*folders, *single_files])
 
 
 def is_local(url: str) -> bool:
@@ -196,7 +198,7 @@ def _check_disk_space(url: str, fs: Any, path: str, folder: str) -> None:
 
 @contextmanager
 def local_copy(url: str, scratch: str | None) -> Iterator[Path]:
-    """Yield a local path of a bag; if it is remote, of a temporary copy in ``scratch``."""
+    """Yield the path of a local bag, or of a temporary copy in the folder ``scratch``."""
     fs, path = file_system(url)
     if is_local(url):
         yield Path(path)
@@ -209,6 +211,6 @@ def local_copy(url: str, scratch: str | None) -> Iterator[Path]:
             fs.get(path, str(copy), recursive=fs.isdir(path))
         except BadBag:
             raise
-        except Exception as error:     # noqa: BLE001 as above
+        except Exception as error:     # noqa: BLE001 each kind of server has other errors
             raise BadBag(f'{url}: {error_text(error) or type(error).__name__}') from None
         yield copy

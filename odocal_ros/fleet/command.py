@@ -28,6 +28,7 @@ GIB = 2**30           # definition: bytes
 
 
 def _byte_count(text: str) -> int:
+    """Return the bytes of a size such as 500M."""
     match = re.fullmatch(r'(\d+(?:\.\d+)?) ?([KMG]?)(?:i?B)?', text)
     if not match or not float(match[1]):
         raise argparse.ArgumentTypeError(f'{text}: required: a size such as 2G or 500M')
@@ -52,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--output', required=True, metavar='DIR', help='folder for rows and results; all workers '
         'must have access')
     add('--vehicle-from', metavar='PATTERN', help='regular expression for the path of a bag; '
-        "its group is the name of the vehicle (default: the bag's folder)")
+        "its group is the name of the vehicle (default: the name of the bag's folder)")
     add('--scheduler', metavar='ADDRESS', help='Dask cluster, such as tcp://host:8786 (default: '
         'local processes)')
     add('--workers', type=_positive_count, metavar='N', help='number of local processes (default: '
@@ -63,9 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'per bag (default 2G)')
     add('--tries', type=_positive_count, default=3, metavar='N', help='attempts per bag '
         'if its local worker process is killed, such as out of memory (default 3)')
-    add('--again', action='store_true', help='retry bags that failed')
+    add('--again', action='store_true', help='retry bags that failed in an earlier run')
     add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles that '
-        'get a report of their own')
+        'get report.html; flagged (default): those that need inspection')
     add('--kpi', action='store_true', help='with limits (--accept): compare the decision on each '
         'leg with the decision on all legs of the vehicle; writes kpi.json')
     add('--files', action='store_true', help='write configuration files for each vehicle '
@@ -101,35 +102,35 @@ def run(args: argparse.Namespace) -> int:
             warn(f'odocal: {counted(len(jobs), "bag")} of '
                  f'{counted(len({b.vehicle for b in bags}), "vehicle")}'
                  + f'; dashboard: {address}' * bool(address))
-        rows = _compute_rows(client, jobs, args)
-        vehicles = write_outcome(client, jobs, rows, output, args)
-    kpi = write_kpi(vehicles, limits, output) if args.kpi else ''
+        row_files = _compute_rows(client, jobs, args)
+        vehicles = write_outcome(client, jobs, row_files, output, args)
+    kpi_text = write_kpi(vehicles, limits, output) if args.kpi else ''
     if args.accept or any(row['decision'] for row in vehicles):
         for row in vehicles:
             print_text(row['line'])
     if not args.quiet:
-        shown = 20    # vehicles that are named on the terminal
-        print_text(summary_text(vehicles, output, shown) + kpi)
+        max_vehicles = 20    # with remarks on the terminal
+        print_text(summary_text(vehicles, output, max_vehicles) + kpi_text)
     return exit_code(vehicles, args.strict)
 
 
 def _compute_rows(client: Any, jobs: 'list[BagJob]', args: argparse.Namespace) -> list[str]:
-    """Compute all rows; return the file of each, and show the progress."""
+    """Compute the rows of all bags and show the progress; return their files, in order."""
     from tqdm import tqdm
 
     from odocal_ros.fleet.bag_jobs import computed_rows
     from odocal_ros.fleet.rows import FAILED, RowStore
-    store, failed = RowStore(jobs[0].folder), 0
-    files = [''] * len(jobs)
+    store, failed_count = RowStore(jobs[0].folder), 0
+    row_files = [''] * len(jobs)
     on_terminal = sys.stderr is not None and sys.stderr.isatty()
     with tqdm(total=len(jobs), unit='bag', disable=args.quiet, file=sys.stderr, dynamic_ncols=True,
               mininterval=0.5 if on_terminal else 30.0, desc='bags') as bar:
         for i, outcome in computed_rows(client, jobs, args.again):
-            files[i] = str(store.path(outcome.key))
-            failed += outcome.status == FAILED
-            bar.set_postfix(failed=failed, refresh=False)
+            row_files[i] = str(store.path(outcome.key))
+            failed_count += outcome.status == FAILED
+            bar.set_postfix(failed=failed_count, refresh=False)
             bar.update()
-    return files
+    return row_files
 
 
 def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
@@ -194,6 +195,7 @@ def _data_frame(client: Any, jobs: Sequence[Any]) -> Any:
     from odocal_ros.fleet.rows import read_rows, RowStore
     from odocal_ros.fleet.tables import table_rows
     store = RowStore(jobs[0].folder)
-    files = {i: store.path(outcome.key) for i, outcome in computed_rows(client, jobs)}
-    rows = zip(jobs, read_rows(files[i] for i in sorted(files)), strict=True)
-    return pd.DataFrame([row for job, bag_row in rows for row in table_rows(job.bag, bag_row)])
+    row_files = {i: store.path(outcome.key) for i, outcome in computed_rows(client, jobs)}
+    bag_rows = read_rows(row_files[i] for i in range(len(jobs)))
+    return pd.DataFrame([row for job, bag_row in zip(jobs, bag_rows, strict=True)
+                         for row in table_rows(job.bag, bag_row)])

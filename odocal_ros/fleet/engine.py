@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 import logging
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 from odocal_ros.errors import BadUsage, OdocalError
 
@@ -76,18 +76,27 @@ def _workers(memory: int) -> int:
     return max(1, min(len(os.sched_getaffinity(0)), free // memory))
 
 
-def task_results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: str,
-                 keys: Sequence[str]) -> Iterator[tuple[int, Any, BaseException | None]]:
-    """
-    Yield (number of the job, result, error) as tasks end, in any order.
+class TaskResult(NamedTuple):
+    """The end of a task."""
 
-    The scheduler gets some tasks for each worker at a time, which limits its memory.
+    job: int        # its index
+    result: Any     # None after an error
+    error: BaseException | None
+
+
+def task_results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: str,
+                 keys: Sequence[str]) -> Iterator[TaskResult]:
+    """
+    Yield the result of ``task`` for each job as tasks end, in any order.
+
+    name, keys : key of each task on the scheduler, which gets some tasks for each worker at a
+    time: this limits its memory.
 
     Raises OdocalError: the connection to the scheduler is lost.
     """
     from distributed import as_completed, CancelledError
     completed, waiting, batch_size = as_completed(), range(len(jobs)), 0
-    running: dict[str, int] = {}      # number of the job by key of its task
+    running: dict[str, int] = {}      # index of the job by key of its task
     while waiting or running:
         error, result = None, None
         if waiting and len(running) <= batch_size:
@@ -97,7 +106,7 @@ def task_results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], n
                                  key=[f'{name}-{keys[i]}' for i in batch])
             running |= {future.key: i for future, i in zip(futures, batch, strict=True)}
             completed.update(futures)
-            del futures
+            del futures      # a reference would keep all results in memory
         future = next(completed)
         try:
             result = future.result()
@@ -105,7 +114,7 @@ def task_results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], n
             raise OdocalError(CONNECTION_LOST) from None
         except Exception as failure:     # noqa: BLE001 of the task, or that its workers were ended
             error = failure
-        yield running.pop(future.key), result, error
+        yield TaskResult(running.pop(future.key), result, error)
         future.release()
 
 

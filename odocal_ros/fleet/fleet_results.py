@@ -21,6 +21,7 @@ from odocal_ros.fleet.bag_jobs import BagJob
 from odocal_ros.fleet.bags import FleetBag, local_copy
 from odocal_ros.fleet.engine import task_results
 from odocal_ros.fleet.page import fleet_page, remarks
+from odocal_ros.fleet.rows import NON_LEG_GROUPS
 from odocal_ros.fleet.vehicles import Vehicle, vehicle_of, VehicleJob
 from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import Verdict
@@ -32,51 +33,51 @@ TABLE, PAGE = 'fleet.csv', 'fleet.html'
 
 @dataclass(frozen=True)
 class GroupJob:
-    """Vehicles that one task computes."""
+    """Vehicles that one task computes, since a task for each would be slower."""
 
     vehicles: tuple[VehicleJob, ...]
-    part: str           # file for their part of the table of legs
-    files: str = ''     # folder for their results, or ''
+    legs_file: str      # for the rows of their legs
+    results_folder: str = ''     # for their result files, or ''
 
 
-def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
+def vehicle_jobs(bags: Sequence[FleetBag], row_files: Sequence[str],
                  settings: dict[str, Any]) -> list[VehicleJob]:
-    """Return a job for each vehicle; ``rows``: the file of each bag's row."""
-    bags_of: dict[str, list[int]] = {}
-    for i, bag in enumerate(bags):
-        bags_of.setdefault(bag.vehicle, []).append(i)
+    """Return a job for each vehicle; ``row_files``: the file of each bag's row."""
+    by_vehicle: dict[str, list[tuple[FleetBag, str]]] = {}
+    for bag, row_file in zip(bags, row_files, strict=True):
+        by_vehicle.setdefault(bag.vehicle, []).append((bag, row_file))
     # dict.fromkeys: a bag given twice under one vehicle has one row
-    return [VehicleJob(vehicle, tuple(bags[i] for i in numbers),
-                       tuple(dict.fromkeys(rows[i] for i in numbers)), settings)
-            for vehicle, numbers in bags_of.items()]
+    return [VehicleJob(vehicle, tuple(bag for bag, _ in entries),
+                       tuple(dict.fromkeys(row_file for _, row_file in entries)), settings)
+            for vehicle, entries in by_vehicle.items()]
 
 
 def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
                      files: bool) -> list[dict[str, Any]]:
     """Return the vehicles' rows, the worst first; write tables, and results if ``files``."""
     import pyarrow.parquet as pq
-    parts = folder / f'.parts.{uuid.uuid4().hex}'
-    parts.mkdir(parents=True)
+    # workers write the legs to files: as results they would fill the memory of the scheduler
+    temporary = folder / f'.parts.{uuid.uuid4().hex}'
+    temporary.mkdir(parents=True)
     try:
-        groups = [GroupJob(group, str(parts / f'{k:06d}.parquet'),
+        groups = [GroupJob(group, str(temporary / f'{k:06d}.parquet'),
                            str(folder / 'vehicles') if files else '')
                   for k, group in enumerate(_grouped(jobs))]
         rows_by_group: dict[int, list[dict[str, Any]]] = {}
-        keys = [Path(group.part).stem + parts.name for group in groups]
+        keys = [f'{k}-{temporary.name}' for k in range(len(groups))]
         for k, rows, error in task_results(client, compute_group, groups, 'vehicles', keys):
             if error is not None:
                 raise error
             rows_by_group[k] = rows
         vehicles = tables.compare_with_model(
-            [row for k in sorted(rows_by_group) for row in rows_by_group[k]])
+            [row for k in range(len(groups)) for row in rows_by_group[k]])
         tables.write_table(folder / tables.LEGS, tables.leg_schema(), (
-            pq.ParquetFile(part).read(use_threads=False)
-            for part in sorted(parts.glob('*.parquet'))))
+            pq.ParquetFile(group.legs_file).read(use_threads=False) for group in groups))
         tables.write_table(folder / tables.VEHICLES, tables.vehicle_schema(),
                            tables.vehicle_batches(vehicles))
         return vehicles
     finally:
-        shutil.rmtree(parts, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
@@ -93,7 +94,7 @@ def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
 
 
 def compute_group(group: GroupJob) -> list[dict[str, Any]]:
-    """Compute vehicles one after the other; write their legs as a part, return their rows."""
+    """Compute vehicles one after the other; write the rows of their legs, return their rows."""
     import pyarrow as pa
     import pyarrow.parquet as pq
     rows, legs = [], []
@@ -101,9 +102,9 @@ def compute_group(group: GroupJob) -> list[dict[str, Any]]:
         vehicle = vehicle_of(job)
         rows.append(vehicle.row)
         legs += vehicle.legs
-        if group.files and vehicle.calibration is not None:
-            _write_files(vehicle, Path(group.files))
-    pq.write_table(pa.Table.from_pylist(legs, schema=tables.leg_schema()), group.part,
+        if group.results_folder and vehicle.calibration is not None:
+            _write_files(vehicle, Path(group.results_folder))
+    pq.write_table(pa.Table.from_pylist(legs, schema=tables.leg_schema()), group.legs_file,
                    compression='zstd')
     return rows
 
@@ -128,11 +129,15 @@ class ReportJob:
     output: str     # folder
 
 
-def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], output: Path,
+def write_outcome(client: Any, jobs: Sequence[BagJob], row_files: Sequence[str], output: Path,
                   args: Namespace) -> list[dict[str, Any]]:
-    """Write tables, reports and page from the rows of all bags; return the vehicles' rows."""
-    groups = vehicle_jobs([job.bag for job in jobs], rows, run_settings(jobs))
-    vehicles = compute_vehicles(client, groups, output, args.files)
+    """
+    Write tables, reports and page of a fleet; return the vehicles' rows, the worst first.
+
+    row_files : the file of each job's row.   args : of the command: ``files``, ``reports``.
+    """
+    by_vehicle = vehicle_jobs([job.bag for job in jobs], row_files, run_settings(jobs))
+    vehicles = compute_vehicles(client, by_vehicle, output, args.files)
     with locked(output):          # another fleet's command may write here too
         write_text(output / TABLE, _csv(output / tables.VEHICLES))
     _draw_reports(client, vehicles, jobs, output, args.reports)
@@ -143,15 +148,15 @@ def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], outp
 
 def run_settings(jobs: Sequence[BagJob]) -> dict[str, Any]:
     """Return the settings of this run that do not affect legs, such as the limits."""
-    from odocal_ros.fleet.rows import GROUPS_NOT_OF_LEGS
     from odocal_ros.library.arguments import config_of
     from odocal_ros.settings.config import flat
+    # an unset frame of the IMU keeps the one in the messages of the bag
     return {name: value for name, value in flat(config_of(jobs[0].config)).items()
-            if name.partition('.')[0] in GROUPS_NOT_OF_LEGS and (name != 'frames.imu' or value)}
+            if name.partition('.')[0] in NON_LEG_GROUPS and (name != 'frames.imu' or value)}
 
 
 def _csv(table: Path) -> str:
-    """Return a table as text for a spreadsheet."""
+    """Return a Parquet file as CSV whose texts a spreadsheet does not take for formulas."""
     import pyarrow as pa
     from pyarrow import csv, parquet as pq
     columns = pq.ParquetFile(table).read(use_threads=False)

@@ -7,21 +7,21 @@ from collections import Counter
 from collections.abc import Sequence
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 
 from odocal_ros import __version__
 from odocal_ros.fleet import tables
-from odocal_ros.fleet.statistics import MIN_VEHICLES, Population, population
+from odocal_ros.fleet.statistics import MIN_VEHICLES, MODEL_OUTLIER_SIGMAS, Population, population
 from odocal_ros.output import plot_style as style
 from odocal_ros.output.report import render_page
 from odocal_ros.output.summary import DEG
 from odocal_ros.output.value_text import counted, MAIN_VALUES, with_sigma
 from odocal_ros.settings.levels import TYRE_SPREAD
 
-MAX_POINTS = 3000       # judgement: of a picture: more are thinned, except outliers
+MAX_POINTS = 3000       # judgement: points of a figure; more are thinned, except outliers
 
 
 def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[style.Drawing]:
@@ -39,7 +39,7 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[style.
 
 
 def _population_figure(name: str, rows: list[dict[str, Any]]) -> style.Drawing:
-    """Draw each vehicle's value against its model's median, one column a model."""
+    """Draw each vehicle's deviation from the median of its model, one column for each model."""
     models = sorted({row['model'] for row in rows})
     figure, (ax,) = style.new_figure_column(2.8)
     is_scale, points = name == 'scale_factor', []
@@ -62,48 +62,48 @@ def _population_figure(name: str, rows: list[dict[str, Any]]) -> style.Drawing:
     _limit_axis(ax, np.array(points))
     ax.set_xticks(range(len(models)), [model or 'no model' for model in models])
     ax.set_ylabel('deviation from the median, ' + ('%' if is_scale else 'deg'))
-    title = f'{name.replace("_", " ").capitalize()} by model.'
-    description = ('One point per vehicle with its sigma; red: outlier of its model; arrow: '
-                   'outside the plot.')
-    return title, description, style.svg(figure, f'population-{MAIN_VALUES[name]}',
-                                         f'{title} {description}')
+    return style.drawing(
+        figure, f'population-{MAIN_VALUES[name]}',
+        f'{name.replace("_", " ").capitalize()} by model',
+        'One point per vehicle with its sigma; red: outlier of its model; arrow: beyond the axis.')
 
 
 def _limit_axis(ax: Any, points: np.ndarray) -> None:
-    """Limit the y axis to most points, (n, 2) x and y; others are arrows at the edge."""
-    shown_medians = 6.0    # median distances from 0: half the height of the plot
-    usual = shown_medians * float(np.median(np.abs(points[:, 1])))
-    outside = np.abs(points[:, 1]) > 2 * usual
-    if not outside.any() or not usual:
+    """Limit the y axis to most points, (n, 2) x and y; draw others as arrows at the edge."""
+    medians_in_half = 6.0    # half the height of the plot, in median distances from 0
+    half_height = medians_in_half * float(np.median(np.abs(points[:, 1])))
+    outside = np.abs(points[:, 1]) > 2 * half_height
+    if not outside.any() or not half_height:
         return
-    limit = 1.15 * max(usual, float(np.abs(points[~outside, 1]).max()))
+    limit = 1.15 * max(half_height, float(np.abs(points[~outside, 1]).max()))
     ax.set_ylim(-limit, limit)
-    for sign, mark in ((1, '^'), (-1, 'v')):
+    for sign, arrow in ((1, '^'), (-1, 'v')):
         x = points[outside & (sign * points[:, 1] > 0), 0]
-        ax.plot(x, np.full(len(x), sign * 0.95 * limit), mark, ms=6, color=style.RED)
+        ax.plot(x, np.full(len(x), sign * 0.95 * limit), arrow, ms=6, color=style.RED)
 
 
 def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> style.Drawing | None:
-    """Draw the scale of legs over dates, those that changed or drift highlighted."""
+    """Draw the scale of legs over dates; vehicles that need inspection have a line each."""
     current = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
     max_lines = 6    # vehicles that are highlighted
-    shown = [row['vehicle'] for row in vehicles if row['vehicle'] in current and any(
-        change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:max_lines]
-    shown += [row['vehicle'] for row in vehicles
-              if row['vehicle'] in current and tables.needs_inspection(row)
-              and row['vehicle'] not in shown][:max_lines - len(shown)]
-    points = _read_points(legs, set(current), set(shown))
+    known = [row for row in vehicles if row['vehicle'] in current]
+    changed = [row['vehicle'] for row in known if any(
+        change['value'] == 'scale_factor' for change in json.loads(row['changes']))]
+    highlighted = list(dict.fromkeys([*changed, *(
+        row['vehicle'] for row in known if tables.needs_inspection(row))]))[:max_lines]
+    points = _read_points(legs, set(current), set(highlighted))
     if not points:
         return None
     figure, (ax,) = style.new_figure_column(3.4)
-    others = np.array([(t, scale / current[vehicle]) for vehicle, t, scale, _ in points
-                       if vehicle not in shown]).reshape(-1, 2)
+    others = np.array([(point.t, point.scale / current[point.vehicle]) for point in points
+                       if point.vehicle not in highlighted]).reshape(-1, 2)
     ax.plot(others[:, 0].astype('datetime64[s]'), (others[:, 1] - 1) * 100, '.', ms=2.5,
             color=style.GREY, label='others')
     styles = [(colour, mark) for mark in 'os'
               for colour in (style.BLUE, style.RED, style.GREEN, style.PINK)]
-    for vehicle, (colour, mark) in zip(shown, styles, strict=False):
-        t, scale, sigma = np.array(sorted(point[1:] for point in points if point[0] == vehicle)).T
+    for vehicle, (colour, mark) in zip(highlighted, styles, strict=False):
+        t, scale, sigma = np.array(sorted(point[1:] for point in points
+                                          if point.vehicle == vehicle)).T
         ax.errorbar(t.astype('datetime64[s]'), (scale / current[vehicle] - 1) * 100,
                     sigma / current[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
                     label=vehicle[:18])
@@ -112,29 +112,32 @@ def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> style.Dra
     figure.subplots_adjust(bottom=0.2, top=0.82)
     figure.legend(loc='upper center', borderaxespad=0.2, ncols=4, handlelength=1.4,
                   columnspacing=1.0)
-    title = 'Scale over time.'
-    description = ('Legs relative to the current scale of their vehicle. Lines: vehicles that '
-                   'changed or need inspection, the worst first.')
-    return title, description, style.svg(figure, 'control', f'{title} {description}')
+    return style.drawing(figure, 'control', 'Scale over time',
+                         'Legs relative to the current scale of their vehicle. Lines: vehicles '
+                         'that changed or need inspection, the worst first.')
 
 
-def _read_points(path: Path, known: set[str],
-                 shown: set[str]) -> list[tuple[str, float, float, float]]:
-    """
-    Return (vehicle, seconds since 1970, scale, sigma) of the legs of known vehicles.
+class _LegPoint(NamedTuple):
+    """The scale of a leg."""
 
-    shown : vehicles whose legs are all returned; those of others are thinned.
-    """
+    vehicle: str
+    t: float          # s since 1970
+    scale: float
+    sigma: float
+
+
+def _read_points(path: Path, known: set[str], highlighted: set[str]) -> list[_LegPoint]:
+    """Return the scales of the legs of known vehicles; of those not highlighted, every n-th."""
     import pyarrow.parquet as pq
     columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
     with pq.ParquetFile(path) as file:
         stride = max(1, file.metadata.num_rows // MAX_POINTS)
         rows = (row for batch in file.iter_batches(columns=columns, batch_size=10_000,
                                                    use_threads=False) for row in batch.to_pylist())
-        return [(row['vehicle'], row['start_ns'] / 1e9, row['scale_factor'],
-                 row['scale_factor_sigma'] or 0.0) for k, row in enumerate(rows, 1)
+        return [_LegPoint(row['vehicle'], row['start_ns'] / 1e9, row['scale_factor'],
+                          row['scale_factor_sigma'] or 0.0) for k, row in enumerate(rows, 1)
                 if row['scale_factor'] is not None and row['verdict'] != 'rejected'
-                and row['vehicle'] in known and (row['vehicle'] in shown or k % stride == 0)]
+                and row['vehicle'] in known and (row['vehicle'] in highlighted or k % stride == 0)]
 
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
@@ -196,35 +199,37 @@ def _vehicle_row(row: dict[str, Any]) -> dict[str, Any]:
     """Return a row of the table of vehicles as text."""
     values = [_cell(row, 'scale_factor', 1.0), _cell(row, 'yaw_mounting_angle', DEG),
               _cell(row, 'pitch_mounting_angle', DEG), _cell(row, 'drift_per_year', 100.0)]
-    no_report = [f'no report: {row["report"]}'] if row['report'] else []
+    report_error = [f'no report: {row["report"]}'] if row['report'] else []
     return {'vehicle': row['vehicle'], 'model': row['model'], 'cells': values,
             'verdict': row['decision'] or row['verdict'],
             'legs': f'{row["legs_good"]} of {row["legs"]}', 'km': f'{row["distance_km"]:.1f}',
             'since': f'{row["since"]:%Y-%m-%d}' if row['since'] else '',
-            'remarks': '; '.join(remarks(row)[1:] + no_report),
+            'remarks': '; '.join(remarks(row)[1:] + report_error),
             'link': f'reports/{quote(tables.folder_name(row["vehicle"]))}/report.html'
                     if row['report'] == '' else ''}
 
 
 def _cell(row: dict[str, Any], name: str, factor: float) -> str:
-    """Return a value of a row with its sigma, times a factor, as text."""
+    """Return a value of a row with its sigma, times the factor to the printed unit, as text."""
     if row[name] is None:
         return '-'
     return with_sigma(row[name], row[f'{name}_sigma'], factor, signed=factor != 1.0)
 
 
 def remarks(row: dict[str, Any]) -> list[str]:
-    """Return the verdict on a vehicle, and sentences for its inspection."""
+    """Return the verdict on a vehicle, and the findings that need inspection as sentences."""
     texts = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+z.2f} %' if change['value'] == 'scale_factor' else
                 f'{DEG * change["size"]:+z.2f} deg')
-        too_large = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
+        is_too_large = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
         texts.append(f'{change["value"].replace("_", " ")} changed by {size} between '
                      f'{change["after"][:10]} and {change["by"][:10]}'
-                     + ', too large for tyres: check the odometer' * too_large)
+                     + (f', more than tyres explain ({100 * TYRE_SPREAD:g} %): check the odometer'
+                        * is_too_large))
     if row['outlier']:
-        texts.append(f'outlier of its model: {", ".join(row["outlier"].split())}')
+        texts.append('outlier among the vehicles of its model (limit '
+                     f'{MODEL_OUTLIER_SIGMAS:g} sigma): {", ".join(row["outlier"].split())}')
     if row['odd_legs']:
         texts.append(f'outlier legs: {", ".join(row["odd_legs"].split())}')
     if row['rejected_for'] and not (row['rejected_since'] and row['why']):    # else stated there

@@ -33,7 +33,7 @@ from odocal_ros.settings.config import Config, flat, with_settings
 DONE, FAILED = 'done', 'failed'
 KEY, MAGIC = re.compile('[0-9a-f]{40}'), b'PAR1'
 # groups of settings that do not affect the legs of a bag
-GROUPS_NOT_OF_LEGS = ('accept', 'output', 'journal', 'publish', 'frames', 'diagnostic_updater')
+NON_LEG_GROUPS = ('accept', 'output', 'journal', 'publish', 'frames', 'diagnostic_updater')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +91,7 @@ def changed_settings(config: Config) -> dict[str, Any]:
 def settings_key(config: Config, *others: dict[Any, Any] | tuple[Any, ...]) -> str:
     """Return a hash of the settings that affect the legs of a bag, and of other arguments."""
     return key_of([[name, repr(value)] for name, value in flat(config).items()
-                   if name.partition('.')[0] not in GROUPS_NOT_OF_LEGS], *others)
+                   if name.partition('.')[0] not in NON_LEG_GROUPS], *others)
 
 
 class RowStore:

@@ -29,9 +29,9 @@ MIN_VEHICLES = 3            # judgement: for a spread
 
 
 class Change(NamedTuple):
-    """A step: from leg ``leg`` on, by ``size`` of the value, with its sigma."""
+    """A step of the value."""
 
-    leg: int
+    leg: int         # first leg with the changed value, from 0
     size: float
     sigma: float
 
@@ -68,11 +68,12 @@ def significance_limit(n: int) -> float:
 
 def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
     """
-    Return the changes of n values in order, y (n,), of covariance V, and their slope over t.
+    Return the changes of n values and their slope.
 
+    y : (n,) values in the order of legs.   V : (n, n) their covariance.   t : (n,) for the slope.
     An outlier at the last leg is a change, since no later leg contradicts it.
     """
-    n, steps = len(y), len(y) - 1
+    n, step_count = len(y), len(y) - 1
     if n < 2:
         return History()
     has_slope = t is not None and np.ptp(t) > 0 and n > 2
@@ -85,14 +86,15 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
     slope = W.shape[1] - 1 if has_slope else -1
     selected = sorted(_select(z, level[:, None], W, significance_limit(n)))
     size, sigma = _fit(z, np.column_stack([level, W[:, selected]]))
+    # column of W -> its factor and sigma
     estimate = {k: (float(size[i]), float(sigma[i])) for i, k in enumerate(selected, 1)}
     if has_slope and slope not in estimate and n > len(selected) + 2:
         X = np.column_stack([level, W[:, selected], W[:, slope]])
         if np.linalg.matrix_rank(X) == X.shape[1]:
             size, sigma = _fit(z, X)
             estimate[slope] = float(size[-1]), float(sigma[-1])
-    return History(tuple(Change(k + 1, *estimate[k]) for k in selected if k < steps),
-                   tuple(k - steps + 1 for k in selected if steps <= k != slope),
+    return History(tuple(Change(k + 1, *estimate[k]) for k in selected if k < step_count),
+                   tuple(k - step_count + 1 for k in selected if step_count <= k != slope),
                    *estimate.get(slope, (None, None)))
 
 
@@ -124,7 +126,7 @@ def _select(z: Floats, level: Floats, W: Floats, limit: float) -> list[int]:
 
 
 def _fit(z: Floats, X: Floats) -> tuple[Floats, Floats]:
-    """Return the factors of the columns of X, and their sigmas, where z has unit variance."""
+    """Return the least-squares factors of the columns of X for z, of unit variance; sigmas."""
     C = np.linalg.inv(X.T @ X)
     return C @ (X.T @ z), np.sqrt(np.diag(C))
 
@@ -168,7 +170,7 @@ def _spread(deviation: Floats, sigmas: Floats) -> float:
     if np.median(deviation / np.maximum(sigmas, 1e-300)) <= NORMAL_MEDIAN:
         return 0.0
     low, high = 0.0, float(deviation.max()) / NORMAL_MEDIAN
-    for _ in range(60):
+    for _ in range(60):      # bisection to the last digit
         middle = (low + high) / 2
         too_small = np.median(deviation / np.hypot(sigmas, middle)) > NORMAL_MEDIAN
         low, high = (middle, high) if too_small else (low, middle)

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tables legs.parquet and vehicles.parquet of a fleet: their columns and rows, and writing."""
+"""
+The tables legs.parquet and vehicles.parquet of a fleet: their columns and rows, and writing.
+
+Also the comparison of vehicles of one model, and the order of vehicles, the worst first.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime, UTC
@@ -31,12 +35,12 @@ VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in VALUES)
 def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
             leg: LegResult) -> dict[str, Any]:
     """Return the row of a leg; number : of the leg in its vehicle or bag, from 1."""
-    row = {'vehicle': vehicle, 'model': model, 'leg': number, 'bag': one_line(leg.bag),
+    cells = {'vehicle': vehicle, 'model': model, 'leg': number, 'bag': one_line(leg.bag),
            'odometer_km': odometer_km, 'start': utc(leg.start_ns), 'start_ns': leg.start_ns,
            'stop_ns': leg.stop_ns, 'duration_s': leg.duration, 'distance_m': leg.distance,
            'fixes': leg.fixes, 'verdict': leg.verdict.value,
            'reasons': ' '.join(dict.fromkeys(reason.code.name for reason in leg.all_reasons))}
-    return row | value_cells(leg_estimates(leg))
+    return cells | value_cells(leg_estimates(leg))
 
 
 def value_cells(estimates: dict[str, Estimate]) -> dict[str, Any]:
@@ -57,7 +61,7 @@ def table_rows(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
 
 
 def utc(stamp_ns: int) -> datetime:
-    """Return a stamp as a date."""
+    """Return the date of a stamp, ns since 1970."""
     return datetime.fromtimestamp(stamp_ns / 1e9, UTC)
 
 
@@ -87,7 +91,7 @@ def vehicle_schema() -> Any:
 
 
 def vehicle_batches(rows: Sequence[dict[str, Any]]) -> Iterator[Any]:
-    """Yield vehicles.parquet in pieces."""
+    """Yield the rows of vehicles as tables of 1000 rows, which limits the memory."""
     import pyarrow as pa
     for k in range(0, len(rows), 1000):
         yield pa.Table.from_pylist(rows[k:k + 1000], schema=vehicle_schema())
@@ -105,7 +109,7 @@ def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:
 
 
 def folder_name(vehicle: str) -> str:
-    """Return a unique name for a vehicle's folder that is never a path."""
+    """Return the unique name of a vehicle's folder: without / and leading dots, not empty."""
     from urllib.parse import quote
     name = quote(vehicle, safe=' ')
     name = name.replace('.', '%2E', 1) if name.startswith('.') else name or '_'
@@ -141,14 +145,14 @@ def compare_with_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def needs_inspection(row: dict[str, Any]) -> bool:
-    """Return True if a vehicle needs inspection."""
+    """Return True for failed or rejected data, outliers, changes and unmet limits of a vehicle."""
     return bool(row['outlier'] or row['bags_failed'] or row['odd_legs'] or row['rejected_for']
                 or json.loads(row['changes']) or row['verdict'] == 'rejected'
                 or row['decision'] in ('FAIL', 'UNDECIDED'))
 
 
 def _severity(row: dict[str, Any]) -> tuple[bool | float | str, ...]:
-    """Return the sorting key of a vehicle, the worst first."""
+    """Return the sort key of a vehicle: without legs, by verdict, outlier, rejected now, ..."""
     verdict = row['decision'] or row['verdict']
     largest_deviation = max(abs(row[f'{short}_deviate'] or 0.0) for short in MAIN_VALUES.values())
     return (bool(row['legs']), WORST_FIRST.index(verdict), not row['outlier'],

@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The result of a vehicle of a fleet: changes, calibration since the last change, pass or fail."""
+"""
+The result of a vehicle of a fleet from the stored legs of its bags.
+
+Its values over all legs show changes, such as new tyres. The legs since the last change give the
+calibration and the decision on the limits.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -43,54 +48,59 @@ class DrivenLeg(NamedTuple):
 
 def legs_by_time(rows: Sequence[Row], bags: dict[str, FleetBag]) -> list[DrivenLeg]:
     """Return the legs of rows by time, with unique bag names as in replay; bags : by path."""
-    legs = [row.leg_results() for row in rows]
-    entries = [{'bag': next((leg.bag for leg in bag_legs), row.bag)}
-               for row, bag_legs in zip(rows, legs, strict=True)]
-    with_names, _ = unique_names([Path(row.bag) for row in rows], legs, entries)
-    km = [bags[row.bag].odometer_km if row.bag in bags else row.odometer_km
-          for row, bag_legs in zip(rows, legs, strict=True) for _ in bag_legs]
-    driven = map(DrivenLeg, with_names, map(leg_estimates, with_names), km)
-    return sorted(driven, key=lambda driven: driven.leg.start_ns)
+    legs_by_row = [row.leg_results() for row in rows]
+    inputs = [{'bag': next((leg.bag for leg in legs), row.bag)}
+              for row, legs in zip(rows, legs_by_row, strict=True)]
+    named_legs, _ = unique_names([Path(row.bag) for row in rows], legs_by_row, inputs)
+    odometer_km = [bags[row.bag].odometer_km if row.bag in bags else row.odometer_km
+                   for row, legs in zip(rows, legs_by_row, strict=True) for _ in legs]
+    driven_legs = map(DrivenLeg, named_legs, map(leg_estimates, named_legs), odometer_km)
+    return sorted(driven_legs, key=lambda driven: driven.leg.start_ns)
 
 
 @dataclass(frozen=True)
 class ValueHistory:
-    """The history of a value."""
+    """Changes, outliers and drift of a value over the legs of a vehicle."""
 
-    legs: tuple[int, ...] = ()            # numbers of the legs that determine it
-    by_date: History = History()          # over years
-    by_distance: History = History()      # over 1000 km, of the scale only
+    legs: tuple[int, ...] = ()            # indices of the legs that determine the value
+    by_date: History = History()          # drift per year
+    by_distance: History = History()      # drift per 1000 km, of the scale only
 
     @property
     def outlier_legs(self) -> list[int]:
-        """Return the numbers of the single outlier legs."""
+        """Return the indices of the single outlier legs."""
         return [self.legs[k] for k in self.by_date.outliers]
 
 
 def history_of(name: str, legs: Sequence[DrivenLeg], config: Config) -> ValueHistory:
-    """Return the history of a value; a scale is compared by its logarithm."""
+    """Return the history of a value, of a scale that of its logarithm."""
     estimates = [driven.estimates.get(name, UNKNOWN) for driven in legs]
-    numbers = [k for k, driven in enumerate(legs) if driven.leg.verdict is not Verdict.REJECTED
+    indices = [k for k, driven in enumerate(legs) if driven.leg.verdict is not Verdict.REJECTED
                and estimates[k].value is not None]
-    if not numbers:
+    if not indices:
         return ValueHistory()
     is_scale = name == 'scale_factor'
-    value = np.array([estimates[k].value for k in numbers])
+    value = np.array([estimates[k].value for k in indices])
+    # change of the value since the first leg
     y = np.log(value / value[0]) if is_scale else np.asarray(wrap(value - value[0]))
     independent, shared = _errors(name, [legs[k].leg.methods[estimates[k].method]
-                                         for k in numbers])
-    days = np.array([legs[k].leg.drive_start_ns for k in numbers]) / DAY_NS
+                                         for k in indices])
+    days = np.array([legs[k].leg.drive_start_ns for k in indices]) / DAY_NS
     days -= days[0]
     V = covariance(independent, shared, days,
                    config.verdict.scale_drift_per_day if is_scale else 0.0)
-    km = [legs[k].odometer_km for k in numbers]
+    km = [legs[k].odometer_km for k in indices]
     by_distance = History() if not is_scale or None in km else history(y, V, np.array(km) / 1000)
     year = 365.25    # days
-    return ValueHistory(tuple(numbers), history(y, V, days / year), by_distance)
+    return ValueHistory(tuple(indices), history(y, V, days / year), by_distance)
 
 
 def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the variance of independent errors of legs, and the effects of shared errors."""
+    """
+    Return the errors of a value in n legs, one method for each, as arguments of ``covariance``.
+
+    (n,) variance of independent errors, and for each shared source its (n, k) one-sigma effects.
+    """
     independent = np.zeros(len(methods))
     shared: dict[tuple[Any, ...], np.ndarray] = {}
     for k, method in enumerate(methods):
@@ -112,10 +122,10 @@ def rejecting_reasons(leg: LegResult) -> list[Reason]:
 
 def rejected_state_reason(rejected: Sequence[DrivenLeg]) -> Reason:
     """Return the reason for an unknown current state, if the last legs are all rejected."""
-    last = rejecting_reasons(rejected[-1].leg)[0]
+    reason_of_last = rejecting_reasons(rejected[-1].leg)[0]
     since = f'{utc(rejected[0].leg.start_ns):%Y-%m-%d}'
-    return replace(last, text=f'the last {len(rejected)} legs, since {since}, are all rejected: '
-                   f'{last.text}')
+    return replace(reason_of_last, text=f'the last {len(rejected)} legs, since {since}, are all '
+                   f'rejected; the last one: {reason_of_last.text}')
 
 
 @dataclass(frozen=True)
@@ -124,13 +134,13 @@ class VehicleJob:
 
     vehicle: str
     bags: tuple[FleetBag, ...]
-    rows: tuple[str, ...]     # files of their rows
+    row_files: tuple[str, ...]     # of the bags
     settings: dict[str, Any] = field(default_factory=dict)    # of this run, such as the limits
 
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """Result of a vehicle."""
+    """Result of a vehicle: its rows in the tables, and its calibration for result files."""
 
     row: dict[str, Any]            # of vehicles.parquet
     legs: list[dict[str, Any]]     # rows of legs.parquet
@@ -139,47 +149,48 @@ class Vehicle:
     inputs: tuple[dict[str, Any], ...] = ()    # entries of its bags in calibration.json
 
 
-def _failure(bag: str, reason: str) -> str:
-    """Return the reason of a failed bag with the name of the bag, once."""
-    return f'{bag}: {reason.removeprefix(f"{bag}: ")}'
-
-
 def vehicle_of(job: VehicleJob) -> Vehicle:
     """Return the result of a vehicle from the rows of its bags."""
-    rows = [row for row in read_rows(job.rows) if row.vehicle == job.vehicle]
-    done = sorted((row for row in rows if row.status == DONE), key=lambda row: row.start_ns)
-    failed = [row for row in rows if row.status != DONE]
-    row = {'vehicle': job.vehicle, 'model': next((bag.model for bag in job.bags if bag.model), ''),
-           'bags': len(rows), 'bags_failed': len(failed), 'failures': '; '.join(
-               _failure(Path(bag_row.bag).name, bag_row.reason) for bag_row in failed[:5])}
+    bag_rows = [row for row in read_rows(job.row_files) if row.vehicle == job.vehicle]
+    done = sorted((row for row in bag_rows if row.status == DONE), key=lambda row: row.start_ns)
+    row = _bag_columns(job, bag_rows)
     legs = legs_by_time(done, {bag.bag: bag for bag in job.bags})
     if not legs:
         limits = with_settings(Config(), job.settings).accept.limits
         return Vehicle(_row_without_legs(row, Decision.UNDECIDED.value if limits else ''), [])
     config = with_settings(done[-1].config(), job.settings)
     histories = {name: history_of(name, legs, config) for name in MAIN_VALUES}
-    # first legs of the periods without changes
+    # indices of the first legs of the periods without changes
     starts = sorted({0, *(values.legs[change.leg] for values in histories.values()
                           for change in values.by_date.changes)})
-    current = legs[starts[-1]:]
-    calibration = combine([driven.leg for driven in current], config, imu=known_imu(config))
-    rejected = legs[1 + max((k for k, driven in enumerate(legs)
-                             if driven.leg.verdict is not Verdict.REJECTED), default=-1):]
-    if len(rejected) >= MIN_REJECTED_LEGS and calibration.verdict is not Verdict.REJECTED:
+    current_legs = legs[starts[-1]:]
+    calibration = combine([driven.leg for driven in current_legs], config, imu=known_imu(config))
+    last_rejected = legs[1 + max((k for k, driven in enumerate(legs)
+                                  if driven.leg.verdict is not Verdict.REJECTED), default=-1):]
+    if len(last_rejected) >= MIN_REJECTED_LEGS and calibration.verdict is not Verdict.REJECTED:
         calibration = replace(
-            calibration, reasons=(rejected_state_reason(rejected), *calibration.reasons))
-    row |= _current_state(calibration, config, legs, starts) | _changes(histories, legs) \
-        | {'rejected_for': ' '.join(dict.fromkeys(
+            calibration, reasons=(rejected_state_reason(last_rejected), *calibration.reasons))
+    since_ns = current_legs[0].leg.start_ns
+    row |= _current_state(calibration, config, legs, since_ns) | _changes(histories, legs) | {
+        'rejected_for': ' '.join(dict.fromkeys(
             reason.code.name for driven in legs for reason in rejecting_reasons(driven.leg))),
-           'rejected_since': utc(rejected[0].leg.start_ns) if rejected else None}
-    since = current[0].leg.start_ns
-    row |= {'current_bags': [bag_row.bag for bag_row in done
-                             if bag_row.start_ns >= since or bag_row is done[-1]],
-            'report': None}
+        'rejected_since': utc(last_rejected[0].leg.start_ns) if last_rejected else None,
+        'current_bags': [bag_row.bag for bag_row in done
+                         if bag_row.start_ns >= since_ns or bag_row is done[-1]],
+        'report': None}
     leg_rows = [_leg_row(row, k, driven, starts, histories) for k, driven in enumerate(legs)]
     inputs = tuple({'bag': bag_row.bag, 'sha256': bag_row.sha256,
                     'topics': json.loads(bag_row.topics)} for bag_row in done)
     return Vehicle(row, leg_rows, calibration, config, inputs)
+
+
+def _bag_columns(job: VehicleJob, bag_rows: Sequence[Row]) -> dict[str, Any]:
+    """Return columns: the vehicle, its numbers of bags, and the reasons of failed ones."""
+    failed = [(Path(row.bag).name, row.reason) for row in bag_rows if row.status != DONE]
+    return {'vehicle': job.vehicle,
+            'model': next((bag.model for bag in job.bags if bag.model), ''),
+            'bags': len(bag_rows), 'bags_failed': len(failed), 'failures': '; '.join(
+                f'{name}: {reason.removeprefix(f"{name}: ")}' for name, reason in failed[:5])}
 
 
 def _row_without_legs(row: dict[str, Any], decision: str) -> dict[str, Any]:
@@ -197,7 +208,7 @@ def _row_without_legs(row: dict[str, Any], decision: str) -> dict[str, Any]:
 
 
 def _current_state(calibration: Calibration, config: Config, driven_legs: Sequence[DrivenLeg],
-                   starts: Sequence[int]) -> dict[str, Any]:
+                   since_ns: int) -> dict[str, Any]:
     """Return columns: the calibration since the last change, and sums over all legs."""
     legs = [driven.leg for driven in driven_legs]
     acceptance = accept(calibration, config)
@@ -206,13 +217,13 @@ def _current_state(calibration: Calibration, config: Config, driven_legs: Sequen
         'distance_km': sum(leg.distance for leg in legs) / 1000,
         'driven_h': sum(leg.duration for leg in legs) / 3600,
         'first': utc(legs[0].start_ns), 'last': utc(legs[-1].start_ns),
-        'since': utc(legs[starts[-1]].start_ns),
+        'since': utc(since_ns),
         'verdict': calibration.verdict.value,
         'decision': acceptance.decision.value if acceptance else '',
         'why': acceptance.why if acceptance else '',
         'remedy': acceptance.remedy if acceptance else '',
         'line': accept_line(calibration, acceptance, config) if acceptance else '',
-        'reasons': ' '.join(dict.fromkeys(r.code.name for r in calibration.reasons))}
+        'reasons': ' '.join(dict.fromkeys(reason.code.name for reason in calibration.reasons))}
 
 
 def _changes(histories: dict[str, ValueHistory], legs: Sequence[DrivenLeg]) -> dict[str, Any]:
@@ -237,7 +248,7 @@ def _changes(histories: dict[str, ValueHistory], legs: Sequence[DrivenLeg]) -> d
 
 def _leg_row(row: dict[str, Any], k: int, driven: DrivenLeg, starts: Sequence[int],
              histories: dict[str, ValueHistory]) -> dict[str, Any]:
-    """Return the row of leg k of a vehicle; row : of the vehicle."""
+    """Return the row of leg k, from 0; row : of the vehicle.   starts : legs after a change."""
     return leg_row(row['vehicle'], row['model'], k + 1, driven.odometer_km, driven.leg) | {
         'period': sum(start <= k for start in starts),
         'odd': any(k in values.outlier_legs for values in histories.values())}

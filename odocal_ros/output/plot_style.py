@@ -1,14 +1,15 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Style of all figures, thinning of lines, units of axes, and figures as SVG text or files."""
+"""Common parts of all figures: style, thinning of lines, units of axes, output as SVG or file."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 import io
+from itertools import pairwise
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,7 @@ from odocal_ros.safe_io.atomic_files import whole_file
 # Okabe and Ito's colours, distinguishable with colour blindness
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
-Drawing = tuple[str, str, str]      # title, description, SVG
-MAX_POINTS = 1200   # judgement: points of a line
+MAX_POINTS = 1200   # judgement: points of a line; a figure has fewer pixels
 MAX_MARKS = 400     # judgement: number of single marks
 STYLE: dict[Any, Any] = {
     'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
@@ -30,6 +30,14 @@ STYLE: dict[Any, Any] = {
     'axes.spines.right': False, 'axes.unicode_minus': True, 'path.simplify': True,
     'legend.frameon': False, 'lines.linewidth': 1.4, 'mathtext.default': 'regular'}
 PICTURES = ('.png', '.svg', '.pdf')
+
+
+class Drawing(NamedTuple):
+    """A figure of a page."""
+
+    title: str
+    description: str
+    svg: str      # element for HTML
 
 
 @contextmanager
@@ -62,12 +70,11 @@ def add_legend(figure: Any, axes: Any) -> None:
                       handlelength=2.2, columnspacing=1.4, borderaxespad=0.2)
 
 
-def svg(figure: Any, name: str, description: str) -> str:
+def drawing(figure: Any, name: str, title: str, description: str) -> Drawing:
     """
-    Return a figure as an svg element.
+    Return a figure made under ``apply_style`` as an svg element with its texts.
 
-    figure : made under ``apply_style``.   name : prefix of each id: a page has many figures.
-    description : text alternative.
+    name : prefix of the ids in the element, since a page has many figures.
     """
     from html import escape
 
@@ -82,33 +89,37 @@ def svg(figure: Any, name: str, description: str) -> str:
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'((?:xlink:)?href="|url\()#', rf'\1#{name}-', text)
     head, _, rest = text.partition('>')
-    box = re.findall(r'viewBox="[^"]*"', head)[0]
-    return f'<svg {box} role="img" aria-label="{escape(description, quote=True)}">{rest}'
+    box = re.findall(r'viewBox="[^"]*"', head)[0]      # without width and height: it scales
+    return Drawing(title, description, f'<svg {box} role="img" aria-label="'
+                   f'{escape(f"{title}. {description}", quote=True)}">{rest}')
 
 
 def peak_rows(y: Floats) -> Ints:
-    """Return rows of a line, (m,) int: both ends, and the extreme y of blocks of equal size."""
+    """
+    Return rows of a line y, (n,) or (n, columns), that draw it like all rows: (m,) int.
+
+    They are both ends, and the smallest and the largest value in each of many equal blocks.
+    """
     y = np.asarray(y, float)
     n = len(y)
     if n <= MAX_POINTS:
         return np.arange(n)
     columns = np.nan_to_num(y.reshape(n, -1).T)
     edges = np.linspace(0, n, MAX_POINTS // (2 * len(columns)) + 1).astype(int)
-    keep = {0, n - 1}
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
-        for column in columns[:, a:b]:
-            keep |= {a + int(column.argmin()), a + int(column.argmax())}
-    return np.array(sorted(keep))
+    kept_rows = {0, n - 1}
+    for begin, end in pairwise(edges.tolist()):
+        for block in columns[:, begin:end]:
+            kept_rows |= {begin + int(block.argmin()), begin + int(block.argmax())}
+    return np.array(sorted(kept_rows))
 
 
 def even_rows(n: int, limit: int = MAX_MARKS) -> Ints:
-    """Return at most ``limit`` row numbers of n, both ends included: (m,) int."""
-    return np.unique(np.linspace(0, n - 1, min(n, limit)).round().astype(int)) if n else \
-        np.empty(0, int)
+    """Return at most ``limit`` evenly spaced rows of n, both ends included: (m,) int."""
+    return np.unique(np.linspace(0, max(n - 1, 0), min(n, limit)).round().astype(int))
 
 
 def length_unit(metres: float) -> tuple[float, str]:
-    """Return the factor and the unit for lengths up to ``metres``."""
+    """Return the unit for lengths up to ``metres``, and the factor from m to it."""
     return (1e-3, 'km') if metres > 3000 else (1.0, 'm')
 
 

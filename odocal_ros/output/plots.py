@@ -90,7 +90,7 @@ def _track(evidence: Evidence, name: str, before_word: str,
     style.add_legend(figure, ax)
     text = ('Dead reckoning over the fixes. Both tracks start at the start mark; the calibrated '
             'track should cover the fixes.')
-    return 'Track', text, style.svg(figure, f'{name}-track', text)
+    return style.drawing(figure, f'{name}-track', 'Track', text)
 
 
 def _draw_marks(ax: Any, evidence: Evidence, position_at: Callable[..., Any],
@@ -167,7 +167,7 @@ def _residuals(evidence: Evidence, name: str, before_word: str) -> style.Drawing
     figure.align_ylabels(axes)
     text = ('Dead reckoning minus fix. Along > 0: ahead of the fix; across > 0: left of the fix. '
             'A slope along indicates a scale error, a curve across a heading drift.')
-    return 'Residuals', text, style.svg(figure, f'{name}-residuals', text)
+    return style.drawing(figure, f'{name}-residuals', 'Residuals', text)
 
 
 def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> style.Drawing:
@@ -193,7 +193,7 @@ def _sections(evidence: Evidence, name: str, scale_sigma: float | None) -> style
             'of equal path length. Bars: one sigma of the fixes. Slip, an odometer delay (at '
             'starts and stops) or bad fixes appear as outlier sections. Bars do not include fix '
             'errors that change more slowly than a section.')
-    return 'Scale by section', text, style.svg(figure, f'{name}-sections', text)
+    return style.drawing(figure, f'{name}-sections', 'Scale by section', text)
 
 
 def _motion(evidence: Evidence, name: str) -> style.Drawing:
@@ -207,7 +207,7 @@ def _motion(evidence: Evidence, name: str) -> style.Drawing:
     figure.align_ylabels([upper, lower])
     text = ('Speed from the calibrated odometer (negative: reversing) and turn rate from the '
             'gyro (positive: left), averaged over one second.')
-    return 'Speed and turn rate', text, style.svg(figure, f'{name}-motion', text)
+    return style.drawing(figure, f'{name}-motion', 'Speed and turn rate', text)
 
 
 def _fixes(evidence: Evidence, name: str) -> style.Drawing:
@@ -228,7 +228,7 @@ def _fixes(evidence: Evidence, name: str) -> style.Drawing:
     style.add_legend(figure, ax)
     text = ('Horizontal sigma of each axis as published (or gnss.default_sigma), by status. '
             'Dots at the bottom: fixes not used.')
-    return 'Fix quality', text, style.svg(figure, f'{name}-fixes', text)
+    return style.drawing(figure, f'{name}-fixes', 'Fix quality', text)
 
 
 def _biases(t: Floats, biases: Floats, name: str) -> style.Drawing:
@@ -249,4 +249,4 @@ def _biases(t: Floats, biases: Floats, name: str) -> style.Drawing:
     figure.align_ylabels(axes)
     text = ('IMU biases along the drive, estimated by the smoother. They drift with temperature; '
             'a step, or a drift far beyond the grade, indicates a fault.')
-    return 'Biases', text, style.svg(figure, f'{name}-biases', text)
+    return style.drawing(figure, f'{name}-biases', 'Biases', text)

@@ -141,7 +141,7 @@ def _draw_figures(
             scale = texts.finite_estimate(leg_estimates(leg), 'scale_factor')
             drawn = leg_figures(evidence, f'leg{number}', scale.relative_sigma,
                                 before_label([leg]), _smoother_details(leg))
-            size += sum(len(svg) for _, _, svg in drawn)
+            size += sum(len(figure.svg) for figure in drawn)
             if not figures or size <= MAX_BYTES:
                 figures[number] = drawn
     legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)

@@ -76,7 +76,7 @@ def by_speed(scale: SpeedScale, name: str) -> style.Drawing:
     text = ('Path length from the fixes divided by that of the raw odometer. Each point is a '
             'group of sections of a few seconds. A constant factor gives a horizontal line. '
             f'{fit}.')
-    return 'Scale against speed', text, style.svg(figure, f'{name}-by-speed', text)
+    return style.drawing(figure, f'{name}-by-speed', 'Scale against speed', text)
 
 
 def by_window(windows: Floats, name: str) -> style.Drawing:
@@ -93,8 +93,8 @@ def by_window(windows: Floats, name: str) -> style.Drawing:
             'minutes. Bars: one sigma, from the scatter over eight parts of the leg. A horizontal '
             'line at 0 shows that fix errors do not depend on the motion. If short windows '
             'differ, the fixes contain an odometer, or are filtered or late.')
-    picture = style.svg(figure, f'{name}-by-window', text)
-    return 'Scale in time windows of different length', text, picture
+    return style.drawing(figure, f'{name}-by-window', 'Scale in time windows of different length',
+                         text)
 
 
 def comparison_figure(calibration: Calibration, name: str) -> list[style.Drawing]:
@@ -163,4 +163,4 @@ def _draw_panels(panels: list[Panel], name: str, legs: int) -> style.Drawing:
         ' Legs share some errors (heading source, lever arms), so bars may overlap more than '
         'random errors would.' if legs > 1 else '') + (
         f' Of {legs} legs, the newest {MAX_LEGS}.' if legs > MAX_LEGS else '')
-    return 'Side by side', text, style.svg(figure, f'{name}-compared', text)
+    return style.drawing(figure, f'{name}-compared', 'Side by side', text)

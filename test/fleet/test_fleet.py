@@ -173,8 +173,8 @@ def test_limits_give_a_json_line_per_vehicle_and_the_exit_code(fleet, client, ou
     assert {one['vehicle']: one['decision'] for one in reported} == {
         v['vehicle']: 'UNDECIDED' if v['vehicle'] in broken else 'PASS' for v in fleet.truth}
     why, = [one['why'] for one in reported if one['vehicle'] in broken]
-    assert re.match(r'rejected: ODOMETER_STILL: the last \d legs, since \S+, are all rejected: '
-                    'the fixes move', why)
+    assert re.match(r'rejected: ODOMETER_STILL: the last \d legs, since \S+, are all rejected; '
+                    'the last one: the fixes move', why)
     assert main([*argv, '--accept', 'scale_ratio=0.9:1.01']) == 1      # the shuttle is at 1.014
     reported = {(one := json.loads(line))['vehicle']: one['decision']
                 for line in capsys.readouterr().out.splitlines()}
@@ -206,7 +206,7 @@ def test_a_bag_that_hangs_and_an_invalid_one_do_not_stop_others(fleet, client, t
     assert {row.status for bag, row in rows.items() if bag in {b.bag for b in good}} == {DONE}
     # failed rows are kept, and computed again on request
     assert computed(client, jobs[1:]) == (0, [DONE] * 3 + [FAILED])
-    assert computed(client, jobs[1:2], again=True) == (1, [FAILED])
+    assert computed(client, jobs[1:2], retry_failed=True) == (1, [FAILED])
 
 
 def test_a_bag_whose_worker_is_killed_has_a_row_with_the_reason(fleet, client, tmp_path):
