@@ -130,23 +130,18 @@ def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | N
     estimates = {name: texts.finite_estimate(method.estimates, name)
                  for row in table.values() for name in row if name != 'shared'}
     names = [name for name, estimate in estimates.items() if estimate.value is not None]
-    heads, factors = zip(*(_column(name, estimates[name]) for name in names),
-                         strict=True) if names else ((), ())
-    variances = [sum(row.get(name, 0.0)**2 for row in table.values()) for name in names]
-    rows, small = [], []
+    columns = [_column(name, estimates[name]) for name in names]
     min_share = 0.005    # of a variance
-    for source, row in table.items():
-        shares = [row.get(name, 0.0)**2 / variance if variance else 0.0
-                  for name, variance in zip(names, variances, strict=True)]
-        if max(shares, default=0.0) < min_share:
-            small.append(label(source, local))
-            continue
-        cells = [None if share < min_share else (significant(row[name] * factor), share)
-                 for name, factor, share in zip(names, factors, shares, strict=True)]
-        rows.append((label(source, local), bool(row.get('shared')), cells))
-    totals = [significant(math.sqrt(variance) * factor)
-              for variance, factor in zip(variances, factors, strict=True)]
-    return {'heads': heads, 'rows': rows, 'small': small, 'totals': totals} if rows else None
+    rows, small = tables.budget_rows(table, names, min_share, local)
+    if not rows:
+        return None
+    return {'heads': [head for head, _ in columns], 'small': small, 'totals': [
+        significant(math.sqrt(sum(row.get(name, 0.0)**2 for row in table.values())) * factor)
+        for name, (_, factor) in zip(names, columns, strict=True)], 'rows': [
+        (row.label, row.shared, [
+            None if share < min_share else (significant(effect * factor), share)
+            for effect, (_, factor), share in zip(row.effects, columns, row.shares, strict=True)])
+        for row in rows]}
 
 
 def _column(name: str, estimate: result.Estimate) -> tuple[str, float]:

@@ -20,8 +20,6 @@ ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
 LABEL_WIDTH = 19      # judgement: columns of the label of a value
-# shorter and shorter summaries: True if they contain small errors, notes, the budget
-SHORTER = ((True, True, True), (False, True, True), (False, False, True), (False, False, False))
 MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the warnings first',
            Verdict.REJECTED: 'do not use these values'}
 
@@ -37,15 +35,15 @@ def screen(calibration: result.Calibration, styled: bool = False, width: int = t
     order; verdict, values and actions are not.   brief : omit these, and tables of legs and
     methods that repeat the values.
     """
-    for small_errors, notes, budget in SHORTER[-1:] if brief else SHORTER:
+    for omitted in (3,) if brief else range(4):      # number of kinds of parts that are omitted
         parts = [_head_lines(calibration, styled), _value_lines(calibration, width),
                  [] if brief and len(calibration.legs) == 1 else _leg_table(calibration.legs,
                                                                             width),
                  [] if brief else tables.method_lines(calibration),
                  tables.search_lines(calibration.legs),
                  tables.track_lines(calibration.legs, width),
-                 _budget_lines(calibration, width, small_errors) if budget else [],
-                 texts.reason_lines(calibration.reasons, width, brief=not notes)]
+                 _budget_lines(calibration, width, name_small=omitted < 1) if omitted < 3 else [],
+                 texts.reason_lines(calibration.reasons, width, brief=omitted > 1)]
         text = '\n\n'.join('\n'.join(part) for part in parts if part)
         if rows is None or text.count('\n') < rows:
             break
@@ -127,12 +125,13 @@ def _scale_lines(calibration: result.Calibration) -> list[str]:
 
 
 def _other_lines(estimates: dict[str, result.Estimate], wheels: dict[str, str]) -> list[str]:
-    """Return the lines of the values that the other functions do not show."""
+    """Return the lines of estimates without a format of their own, such as delays."""
     lines = []
     for name in estimates:
         estimate = texts.finite_estimate(estimates, name)
+        quantity = name.rpartition('_')[0]      # without the axis
         if name not in ('scale_factor', 'scale_ratio', result.AS_SENT, *texts.ANGLES, *BIASES,
-                        *wheels) and name[:-2] not in ARMS and estimate.value is not None:
+                        *wheels) and quantity not in ARMS and estimate.value is not None:
             lines.append(_line(tables.source_label(name), texts.with_unit(estimate)))
     return lines
 
@@ -173,10 +172,10 @@ def _wheel_lines(estimates: dict[str, result.Estimate]) -> dict[str, str]:
         wheel = name.removeprefix(result.FACTOR)
         positions = {f'{axis}_position_{wheel}': sides for axis, sides in SIDE_TEXTS.items()}
         if any(position in estimates for position in positions):
-            shown = [f'{abs(e.value):.3f} m {sides[e.value < 0]}'
-                     for position, sides in positions.items()
-                     if (e := texts.finite_estimate(estimates, position)).value is not None]
-            text = '   '.join((texts.with_unit(estimates[name]), *shown))
+            places = [f'{abs(place.value):.3f} m {sides[place.value < 0]}'
+                      for position, sides in positions.items()
+                      if (place := texts.finite_estimate(estimates, position)).value is not None]
+            text = '   '.join((texts.with_unit(estimates[name]), *places))
             lines |= dict.fromkeys(positions, '') | {name: _line(f'wheel {wheel}', text)}
     return lines
 
@@ -198,11 +197,11 @@ def _path_ratio_line(calibration: result.Calibration, scale: result.Estimate,
 
 
 def _gyro_scale_line(calibration: result.Calibration) -> str:
-    """Return the factor for the turn rates of the gyro, '' if it is near 1."""
+    """Return the factor for the yaw rate of the gyro, '' if it is near 1."""
     scale = texts.finite_estimate(calibration.estimates, 'scale_factor')
     method = calibration.methods.get(scale.method)
     error = method.details.get('gyro_scale_z') if method else None
-    min_error = 0.005
+    min_error = 0.005    # also of cheap gyros: their data sheets allow 1 %
     if not error or abs(error['value']) < max(min_error, 3 * error['sigma']):
         return ''
     return _line('gyro scale z', texts.with_sigma(1 - error['value'], error['sigma']))
@@ -211,20 +210,21 @@ def _gyro_scale_line(calibration: result.Calibration) -> str:
 def _lever_arm_line(estimates: dict[str, result.Estimate], arm: str, label: str,
                     width: int) -> str:
     """Return the line with the known coordinates of a lever arm, '' without any."""
-    known_axes = {axis: e for axis in 'xyz'
-                  if (e := texts.finite_estimate(estimates, f'{arm}_{axis}')).value is not None}
-    shown = ', '.join(texts.with_sigma(e.value, e.sigma, signed=True) for e in known_axes.values())
+    coordinates = {axis: texts.finite_estimate(estimates, f'{arm}_{axis}') for axis in 'xyz'}
+    known = {axis: length for axis, length in coordinates.items() if length.value is not None}
+    lengths = ', '.join(texts.with_sigma(length.value, length.sigma, signed=True)
+                        for length in known.values())
     note = '   (assumes no sideslip)' * (arm.startswith('odometer') and width >= texts.WIDTH)
-    axes = ', '.join(known_axes)
+    axes = ', '.join(known)
     if len(f'{label} {axes}') > LABEL_WIDTH:
-        shown = f'{axes}: {shown}'
+        lengths = f'{axes}: {lengths}'
     else:
         label = f'{label} {axes}'
-    return _line(label, f'{shown} m{note}') if known_axes else ''
+    return _line(label, f'{lengths} m{note}') if known else ''
 
 
 def _largest_error_lines(calibration: result.Calibration, width: int) -> list[str]:
-    """Return the lines with the largest error source of scale, yaw and pitch, none without."""
+    """Return the largest error source of scale, yaw and pitch as lines; none without sources."""
     largest = []
     for name, short_name in texts.MAIN_VALUES.items():
         estimate = texts.finite_estimate(calibration.estimates, name)
@@ -233,9 +233,9 @@ def _largest_error_lines(calibration: result.Calibration, width: int) -> list[st
         if source:
             label = tables.source_label(source, result.has_local_positions(calibration.legs))
             largest.append(f'{short_name}: {label} ({100 * share:.0f} %)')
-    # lines are broken between the values only
+    # lines are broken between the values only; 3: indent, and space after the label
     lines = textwrap.wrap('; '.join(largest).replace(' ', '\xa0').replace(';\xa0', '; '),
-                          width - 22)
+                          width - LABEL_WIDTH - 3)
     return [_line('' if k else 'largest error', line.replace('\xa0', ' '))
             for k, line in enumerate(lines)]
 
@@ -260,26 +260,27 @@ def _angle_text(angle: result.Estimate, width: int) -> str:
 
 
 def _leg_table(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
-    rows: list[tuple[str, ...]] = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes',
-                                    'scale factor', 'yaw, deg', 'verdict')]
-    rows += [(str(number), *_leg_row(leg), verdict) for number, (leg, verdict) in enumerate(
-        zip(legs, tables.leg_verdicts(legs), strict=True), 1)]
-    if width < texts.WIDTH:        # without the date, the duration and the number of fixes
-        rows = [(row[0], row[1].removesuffix(', UTC').rpartition(' ')[2], row[2], *row[5:])
-                for row in rows]
-    return texts.table_lines(rows) + texts.lines_of_bags(legs, width) if legs else []
+    if not legs:
+        return []
+    is_wide = width >= texts.WIDTH
+    rows = [{'leg': str(number), **_leg_cells(leg, is_wide), 'verdict': verdict}
+            for number, (leg, verdict) in enumerate(
+                zip(legs, tables.leg_verdicts(legs), strict=True), 1)]
+    heads = [head for head in rows[0] if is_wide or head not in ('min:s', 'fixes')]
+    return texts.table_lines([heads, *([row[head] for head in heads] for row in rows)]) \
+        + texts.lines_of_bags(legs, width)
 
 
-def _leg_row(leg: result.LegResult) -> tuple[str, ...]:
+def _leg_cells(leg: result.LegResult, has_date: bool) -> dict[str, str]:
     estimates = leg_estimates(leg)
-    scale, yaw = (texts.finite_estimate(estimates, n)
-                  for n in ('scale_factor', 'yaw_mounting_angle'))
+    scale, yaw = (texts.finite_estimate(estimates, name)
+                  for name in ('scale_factor', 'yaw_mounting_angle'))
     started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
     minutes, seconds = divmod(round(leg.duration), 60)
-    return (f'{started:%m-%d %H:%M:%S}', texts.length_text(leg.distance),
-            f'{minutes}:{seconds:02d}', str(leg.fixes),
-            '-' if scale.value is None else texts.with_sigma(scale.value, scale.sigma),
-            '-' if yaw.value is None else texts.with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
+    return {'start, UTC': f'{started:%m-%d }' * has_date + f'{started:%H:%M:%S}',
+            'distance': texts.length_text(leg.distance), 'min:s': f'{minutes}:{seconds:02d}',
+            'fixes': str(leg.fixes), 'scale factor': tables.cell(scale),
+            'yaw, deg': tables.cell(yaw, DEG, signed=True)}
 
 
 def _budget_lines(calibration: result.Calibration, width: int, name_small: bool) -> list[str]:

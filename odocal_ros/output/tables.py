@@ -3,12 +3,12 @@
 
 """Tables of legs, error budget and tracks, for terminal, report and spreadsheet."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 import csv
 import io
 import math
 import textwrap
-from typing import Any
+from typing import Any, NamedTuple
 
 from odocal_ros.calib import result
 from odocal_ros.calib.budget import PARAMETERS
@@ -35,10 +35,10 @@ CHECK_LABEL_WIDTH, CHECK_CELL_WIDTH = 22, 9      # judgement: columns
 
 def leg_table(calibration: result.Calibration, config: Config,
               content: dict[str, Any]) -> dict[str, str]:
-    """Return file name -> text, empty without legs."""
+    """Return file name -> text of the table of legs, empty without legs."""
     if not calibration.legs:
         return {}
-    return {LEGS: csv_text([_row(n, leg, calibration) for n, leg in enumerate(
+    return {LEGS: csv_text([_leg_row(n, leg, calibration) for n, leg in enumerate(
         calibration.legs, 1)])}
 
 
@@ -51,7 +51,8 @@ def csv_text(rows: list[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def _row(number: int, leg: result.LegResult, calibration: result.Calibration) -> dict[str, Any]:
+def _leg_row(number: int, leg: result.LegResult,
+             calibration: result.Calibration) -> dict[str, Any]:
     """Return a row; missing values of a leg are empty cells."""
     used = {estimate.method for estimate in calibration.estimates.values()
             if estimate.value is not None}
@@ -85,7 +86,7 @@ def _estimate(leg: result.LegResult, calibration: result.Calibration,
 
 
 def search_lines(legs: tuple[result.LegResult, ...]) -> list[str]:
-    """Return a table of each leg's search, empty without one."""
+    """Return a table of each leg's search of two wheels (method patent), empty without one."""
     lines = []
     for k, leg in enumerate(legs, 1):
         search = next((method.details['search'] for method in leg.methods.values()
@@ -105,7 +106,7 @@ def search_lines(legs: tuple[result.LegResult, ...]) -> list[str]:
             lines.append(f'  {name:24}  {left:10.6g}  {right:10.6g}'
                          f'  {values["heading_deg"]:+9.4f}{distances}')
         if search['left_and_right_held_together']:
-            lines.append('  the fixes do not separate left and right: their ratio is kept')
+            lines.append('  the fixes do not separate left and right: the nominal ratio is kept')
     return lines
 
 
@@ -116,9 +117,9 @@ def shown_verdict(method: result.MethodResult, legs: tuple[result.LegResult, ...
     legs : those of the values, whose reasons apply to each method; rejected ones count only if all
     are rejected.
     """
-    repeated = overlapping_legs([leg for leg in legs
-                                 if verdict_of(leg.reasons) is not Verdict.REJECTED])
-    leg_verdicts = [verdict_of(leg.reasons) for leg in legs if leg not in repeated]
+    overlapping = overlapping_legs([leg for leg in legs
+                                    if verdict_of(leg.reasons) is not Verdict.REJECTED])
+    leg_verdicts = [verdict_of(leg.reasons) for leg in legs if leg not in overlapping]
     used = [verdict for verdict in leg_verdicts if verdict is not Verdict.REJECTED] or leg_verdicts
     worst = Verdict.worst([method.verdict, *used])
     if worst is method.verdict:
@@ -135,25 +136,23 @@ def method_lines(calibration: result.Calibration) -> list[str]:
     for name, method in methods.items():
         scale, *angles = (texts.finite_estimate(method.estimates, parameter)
                           for parameter in ('scale_factor', *texts.ANGLES))
-        rows.append((name, '-' if scale.value is None
-                     else texts.with_sigma(scale.value, scale.sigma),
-                     *('-' if angle.value is None else
-                       texts.with_sigma(angle.value, angle.sigma, math.degrees(1.0), signed=True)
-                       for angle in angles),
-                     shown_verdict(method, calibration.legs) + _rejection_text(method)))
+        code = ''.join(f': {reason.code.name}' for reason in rejecting(method.reasons)[:1])
+        rows.append((name, cell(scale),
+                     *(cell(angle, math.degrees(1.0), signed=True) for angle in angles),
+                     shown_verdict(method, calibration.legs) + code))
     return texts.table_lines(rows)
 
 
-def _rejection_text(method: result.MethodResult) -> str:
-    """Return ': CODE', the first code for which a method is rejected, '' if it is not."""
-    reasons = rejecting(method.reasons)
-    return f': {reasons[0].code.name}' if reasons else ''
+def cell(estimate: result.Estimate, factor: float = 1.0, signed: bool = False) -> str:
+    """Return an estimate times ``factor`` with its sigma; '-' if it is not determined."""
+    return '-' if estimate.value is None else texts.with_sigma(
+        estimate.value, estimate.sigma, factor, signed)
 
 
 def leg_verdicts(legs: tuple[result.LegResult, ...]) -> list[str]:
     """Return the verdict of each leg; 'not used' if an earlier good leg covers its time."""
-    repeated = overlapping_legs([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
-    return ['not used' if leg in repeated else leg.verdict.value for leg in legs]
+    overlapping = overlapping_legs([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
+    return ['not used' if leg in overlapping else leg.verdict.value for leg in legs]
 
 
 def largest_source(method: result.MethodResult | None, name: str) -> tuple[str, float]:
@@ -171,35 +170,59 @@ def source_label(name: str, local: bool = False) -> str:
     return result.name_antenna(LABELS.get(name, name.replace('_', ' ')), local)
 
 
+class BudgetRow(NamedTuple):
+    """An error source in a budget."""
+
+    label: str
+    shared: bool               # the same error in all legs
+    effects: list[float]       # one sigma, for each parameter
+    shares: list[float]        # of the variance of each parameter
+
+
+def budget_rows(table: dict[str, dict[str, Any]], parameters: Sequence[str], min_share: float,
+                local: bool) -> tuple[list[BudgetRow], list[str]]:
+    """
+    Return the rows of a budget, and the labels of sources below ``min_share`` of all variances.
+
+    table : source to one-sigma effect on each parameter, as in calibration.json.
+    local : positions in a local frame.
+    """
+    variances = [sum(row.get(name, 0.0)**2 for row in table.values()) for name in parameters]
+    rows, small = [], []
+    for source, entry in table.items():
+        effects = [entry.get(name, 0.0) for name in parameters]
+        shares = [effect**2 / variance if variance else 0.0
+                  for effect, variance in zip(effects, variances, strict=True)]
+        label = source_label(source, local)
+        if max(shares, default=0.0) < min_share:
+            small.append(label)
+        else:
+            rows.append(BudgetRow(label, bool(entry.get('shared')), effects, shares))
+    return rows, small
+
+
 def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, min_share: float,
-                 hidden: list[str] | set[str] | tuple[Any, ...] = (), width: int = 98,
-                 name_small: bool = True, local: bool = False) -> list[str]:
+                 hidden: Collection[str] = (), width: int = texts.WIDTH, name_small: bool = True,
+                 local: bool = False) -> list[str]:
     """
     Return the lines of a budget, none without one.
 
-    table : source to one-sigma effect on each parameter, as in calibration.json.   scale : scale
-    factor of the scale column.   min_share : of the variance; smaller sources have no line.
-    hidden : parameters that are not determined: their column stays empty.   width : columns of the
-    screen.   name_small : list the smaller sources.   local : positions in a local frame.
+    table, min_share, local : as of ``budget_rows``.   scale : scale factor, m per unit of the
+    odometer.   hidden : parameters that are not determined: their column stays empty.   width :
+    columns of the screen.   name_small : list the sources below ``min_share``.
     """
     if not table:
         return []
-    factor = {PARAMETERS[0]: 1e6 / scale}
-    variances = [sum(row.get(name, 0.0)**2 for row in table.values()) for name in PARAMETERS]
+    shown = {source: {name: effect for name, effect in row.items() if name not in hidden}
+             for source, row in table.items()}
+    rows, small = budget_rows(shown, PARAMETERS, min_share, local)
+    factors = (1e6 / scale, math.degrees(1.0), math.degrees(1.0))
     lines = [texts.table_row(BUDGET_HEAD, BUDGET_WIDTHS)]
-    small = []
     shared = '   shared by all legs' if width > 90 else '  shared'
-    for name, row in table.items():
-        shares = [row.get(p, 0.0)**2 / variance if variance and p not in hidden else 0.0
-                  for p, variance in zip(PARAMETERS, variances, strict=True)]
-        if max(shares) < min_share:
-            small.append(source_label(name, local))
-            continue
-        cells = ['-' if share < min_share else
-                 f'{significant(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
-                 for p, share in zip(PARAMETERS, shares, strict=True)]
-        lines.append(texts.table_row([source_label(name, local), *cells], BUDGET_WIDTHS)
-                     + (shared if row.get('shared') else ''))
+    for row in rows:
+        cells = ['-' if share < min_share else f'{significant(effect * factor)} {share:>4.0%}'
+                 for effect, factor, share in zip(row.effects, factors, row.shares, strict=True)]
+        lines.append(texts.table_row([row.label, *cells], BUDGET_WIDTHS) + shared * row.shared)
     if not (small and name_small):
         return lines
     limit = f'{min_share:.1%}'.replace('.0%', '%').replace('%', ' %')
@@ -208,8 +231,11 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, min_shar
 
 
 def pooled_check(checks: list[tuple[result.TrackCheck | None, int]]) -> result.TrackCheck | None:
-    """Return one check for many legs, each (check, fixes), None without one."""
-    # rms and mean are pooled over fixes; max, end and percent are those of the worst leg
+    """
+    Return one check for many legs from (check, number of fixes) of each; None without checks.
+
+    rms and mean are those of all fixes; maximum, end and percentage those of the worst leg.
+    """
     known_checks = [(check, n) for check, n in checks if check is not None and n]
     if not known_checks:
         return None
@@ -247,7 +273,7 @@ def before_label(legs: Sequence[result.LegResult]) -> str:
 
 def check_table(
         legs: tuple[result.LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """Return heads and rows (label, cells) of dead reckoning against the fixes, none without."""
+    """Return heads and rows (label, cells) of the distances between track and fixes."""
     per_distance = pooled_per_distance(legs)
     rows = []
     for label, name in zip((before_label(legs), 'as calibrated'), CHECKS, strict=True):
