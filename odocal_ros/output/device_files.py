@@ -71,12 +71,12 @@ def controllers(calibration: Calibration, config: Config,
     blocks = _blocks(calibration, config)
     if not blocks:
         return {}
-    return {CONTROLLERS: head(calibration, content) + FOR_CONTROLLERS + ''.join(
+    return {CONTROLLERS: origin_comment(calibration, content) + FOR_CONTROLLERS + ''.join(
         parameter_block(values, name) for name, values in blocks.items())}
 
 
 def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any]]:
-    """Return controller -> parameters, for controllers that fit the drive."""
+    """Return controller -> parameters, for the controllers of this drive (odometer.drive)."""
     radius = wheel_radius(calibration, config)
     if config.odometer.drive in HOLONOMIC:
         lever = finite_estimate(calibration.estimates, 'rotation_lever').value
@@ -141,8 +141,9 @@ def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -
     for description, setting in _device_settings(scale.value, config.wheels.pulses_per_revolution):
         lines += ['', *textwrap.wrap(description, 98, initial_indent='# ',
                                      subsequent_indent='# ')]
-        lines += [setting] if setting else []
-    return {DEVICES: head(calibration, content) + FOR_DEVICES + '\n'.join(lines) + '\n'}
+        lines += [setting] * bool(setting)
+    return {DEVICES: origin_comment(calibration, content) + FOR_DEVICES
+            + '\n'.join(lines) + '\n'}
 
 
 def _device_settings(scale: float, pulses: float) -> list[tuple[str, str]]:
@@ -185,7 +186,7 @@ def wheel_covariance(calibration: Calibration, config: Config,
     text += ('# VIO with wheels (VINS-Fusion forks), m/s per sqrt(Hz):\n'
              f'#   wheel_velocity_noise_sigma: {density:.3g}\n')
     diagonal = {'twist_covariance_diagonal': _diagonal(variances)}
-    return {TWIST: head(calibration, content) + text
+    return {TWIST: origin_comment(calibration, content) + text
             + parameter_block(diagonal, 'diff_drive_controller') + _table(noise)}
 
 
@@ -196,13 +197,14 @@ def _diagonal(variances: np.ndarray[Any, Any]) -> list[float]:
 
 
 def _table(noise: 'TwistNoise') -> str:
-    """Return the variances by speed and turn rate, as parameters of a custom node."""
-    speeds = np.linspace(0.0, noise.fastest[0], 6)
-    rates = np.linspace(0.0, noise.fastest[1], 4)
+    """Return the variances at several speeds and turn rates, as parameters of a custom node."""
+    speed_count, rate_count = 6, 4
+    speeds = np.linspace(0.0, noise.fastest[0], speed_count)
+    rates = np.linspace(0.0, noise.fastest[1], rate_count)
     rows = {f'turn_rate_{k}': {
         'rad_per_s': float(f'{rate:.3g}')} | {
         name: [float(f'{noise.variances(speed, rate)[column]:.3g}') for speed in speeds]
-        for name, column in (('x', 0), ('y', 1), ('yaw', 3)) if column < 3 or noise.has_turn_rate}
+        for name, column in (('x', 0), ('y', 1), *[('yaw', 3)] * noise.has_turn_rate)}
         for k, rate in enumerate(rates)}
     return parameter_block({'period': float(f'{noise.period:.4g}'),
                             'speed': [float(f'{speed:.3g}') for speed in speeds], **rows},
@@ -226,7 +228,7 @@ def imu_errors(calibration: Calibration, config: Config,
             best[f'gyro_bias_{axis}'] = {'value': bias.value, 'sigma': bias.sigma}
     if not best:
         return {}
-    return {IMU_ERRORS: head(calibration, content) + FOR_IMU_ERRORS
+    return {IMU_ERRORS: origin_comment(calibration, content) + FOR_IMU_ERRORS
             + parameter_block(dict(sorted(best.items())), 'imu_errors')}
 
 
@@ -244,13 +246,13 @@ def _imu_errors_of(details: Mapping[str, Any]) -> dict[str, dict[str, float]]:
             for name, entry in errors.items()}
 
 
-def head(calibration: Calibration, content: dict[str, Any]) -> str:
-    """Return ``about`` as comment lines."""
-    return for_comment(about(calibration, content))
+def origin_comment(calibration: Calibration, content: dict[str, Any]) -> str:
+    """Return ``origin_text`` as comment lines."""
+    return for_comment(origin_text(calibration, content))
 
 
-def about(calibration: Calibration, content: dict[str, Any]) -> str:
-    """Return two lines: software, date, legs and bags of the file; its result."""
+def origin_text(calibration: Calibration, content: dict[str, Any]) -> str:
+    """Return two lines on a file: its software, date, legs and bags; the result."""
     inputs = content['inputs']
     bags = ', '.join(str(entry['bag']) for entry in inputs if entry.get('bag')) or 'live'
     bags += ''.join(f', node {entry["node"]}' for entry in inputs if entry.get('node'))

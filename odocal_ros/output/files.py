@@ -4,8 +4,8 @@
 """
 Result files in one folder: calibration.json (schema 1), report, files for other programs.
 
-In: a calibration and its settings. The folder is replaced as a whole, so that its files belong
-together; the report is drawn last, since it takes longest.
+The folder is replaced as a whole, so that its files belong together; the report is drawn last,
+since it takes longest.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -43,43 +43,50 @@ def as_json(calibration: result.Calibration, config: Config, inputs: list[dict[s
     Returns plain dicts and lists, no NaN: a missing number is None.
     """
     values: dict[str, Any] = {
-        name: e.as_dict() | {'unit': e.unit or None, 'method': e.method or None}
-        for name, e in (result.unknown_values('') | calibration.estimates).items()}
+        name: estimate.as_dict() | {'unit': estimate.unit or None,
+                                    'method': estimate.method or None}
+        for name, estimate in (result.unknown_values('') | calibration.estimates).items()}
     main_method = calibration.methods.get(values['scale_factor']['method'])
-    values |= main_method.details.get('beside', {}) if main_method else {}
+    values |= main_method.details.get('beside', {}) if main_method else {}    # no estimates
     values['imu_rotation'] = {'quaternion_xyzw': calibration.imu_rotation_xyzw,
                               'rpy': calibration.imu_rotation_rpy}
     before, after = (pooled_check([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
                      for name in CHECKS)
-    optional: dict[str, Any] = {}
-    if (acceptance := accept(calibration, config)) is not None:
-        optional['acceptance'] = acceptance.as_dict()
-    if calibration.carried:
-        from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO
-        imu_change = 0.1    # of their prior sigma: change by temperature and time
-        optional['imu'] = calibration.carried.select(
-            (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_change).as_dict()
-        if config.leg.automatic:
-            optional['carried'] = calibration.carried.as_dict()
     content: dict[str, Any] = plain({
         'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
         'vehicle': config.vehicle,
         'verdict': calibration.verdict.value,
-        'reasons': [r.as_dict() for r in calibration.reasons],
+        'reasons': [reason.as_dict() for reason in calibration.reasons],
         'result': values,
         'methods': {name: _method(m) for name, m in calibration.methods.items()},
         'legs': [_leg(leg) for leg in calibration.legs],
         'check': _check(before, after, calibration.legs),
         'inputs': inputs,
-        'config': flat(config)} | optional)
+        'config': flat(config)} | _optional_entries(calibration, config))
     return content
 
 
+def _optional_entries(calibration: result.Calibration, config: Config) -> dict[str, Any]:
+    """Return the entries with acceptance limits, and those with information for later legs."""
+    entries: dict[str, Any] = {}
+    if (acceptance := accept(calibration, config)) is not None:
+        entries['acceptance'] = acceptance.as_dict()
+    if calibration.carried:
+        from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO
+        imu_change = 0.1    # change by temperature and time, as a fraction of the prior sigma
+        entries['imu'] = calibration.carried.select(
+            (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_change).as_dict()
+        if config.leg.automatic:
+            entries['carried'] = calibration.carried.as_dict()
+    return entries
+
+
 def _method(method: result.MethodResult) -> dict[str, Any]:
-    """Return the entry of a method; arrays among its details are left out."""
+    """Return the entry of a method, without the arrays of its details."""
     details = {key: detail for key, detail in method.details.items()
                if not isinstance(detail, np.ndarray)}
-    return {'verdict': method.verdict.value, 'reasons': [r.as_dict() for r in method.reasons],
+    return {'verdict': method.verdict.value,
+            'reasons': [reason.as_dict() for reason in method.reasons],
             'estimates': {name: {'value': estimate.value, 'sigma': estimate.sigma,
                                  'unit': estimate.unit}
                           for name, estimate in method.estimates.items()},
@@ -87,7 +94,6 @@ def _method(method: result.MethodResult) -> dict[str, Any]:
 
 
 def _leg(leg: result.LegResult) -> dict[str, Any]:
-    """Return the entry of a leg."""
     return {'bag': leg.bag, 'start': leg.start_ns * 1e-9, 'stop': leg.stop_ns * 1e-9,
             'start_ns': leg.start_ns, 'stop_ns': leg.stop_ns,
             'distance': leg.distance, 'duration': leg.duration, 'imu_samples': leg.imu_samples,
@@ -150,7 +156,7 @@ class Results:
     def write(self, force: bool = False) -> list[Path]:
         """Write all but the report; return the paths."""
         texts = {MAIN: json.dumps(self._content, indent=2, allow_nan=False) + '\n'}
-        texts |= program_files.texts(self._calibration, self._config, self._content)
+        texts |= program_files.file_texts(self._calibration, self._config, self._content)
         with self._bad_usage_for_disk():
             self.folder.put(texts, force)
         return [self.directory / name for name in texts]

@@ -40,32 +40,30 @@ IMU = 'imu_corrector.param.yaml'
 LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_transform.txt')
 NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, TRACK, LEGS, device_files.CONTROLLERS,
          device_files.DEVICES, device_files.TWIST, device_files.IMU_ERRORS}
-# parameters that the node declares also for one wheel, then unknown
+# parameters that the node declares for one wheel too; they are then unknown
 TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'track_width')
 AXES = 'xyz'
 IMU_FRAME = 'imu_link'      # REP-145, by default
 
 
-def texts(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
+def file_texts(calibration: Calibration, config: Config,
+               content: dict[str, Any]) -> dict[str, str]:
     """
     Return file name -> text for the configured formats.
 
     Except calibration.yaml, files are for use on a vehicle: there are none for a rejected
     calibration, and each only if its values are determined.
     """
-    files: dict[str, str] = {}
     formats = config.output.formats
-    if 'params' in formats:
-        files[PARAMS] = _params(calibration, content)
+    files = {PARAMS: _params(calibration, content)} if 'params' in formats else {}
     if calibration.verdict is not Verdict.REJECTED:
-        for name, texts_of in FORMATS.items():
+        for name, make_texts in FORMATS.items():
             if name in formats:
-                files |= texts_of(calibration, config, content)
+                files |= make_texts(calibration, config, content)
     return files
 
 
 def _params(calibration: Calibration, content: dict[str, Any]) -> str:
-    """Return the text of calibration.yaml."""
     unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
     result: dict[str, object] = {}
     for name, entry in (unknown | content['result']).items():
@@ -74,7 +72,7 @@ def _params(calibration: Calibration, content: dict[str, Any]) -> str:
     result |= {'legs': len(calibration.legs),
                'valid': calibration.verdict is not Verdict.REJECTED,
                'stamp': date_text(content['created']), 'vehicle': content['vehicle']}
-    return (device_files.head(calibration, content)
+    return (device_files.origin_comment(calibration, content)
             + '# for the node calibrator at its start: --ros-args --params-file THIS_FILE\n'
             '# scale factor: metres of travel per pulse (per rad for joints, 1 for speeds)\n'
             '# angles: rad, of the IMU on the vehicle about fixed axes; yaw > 0: its x axis '
@@ -94,8 +92,8 @@ def _autoware(calibration: Calibration, config: Config, content: dict[str, Any])
             f'angular_velocity_offset_{axis}': float(b)
             for axis, b in zip(AXES, bias_i, strict=True)} | {
             f'angular_velocity_stddev_{axis}{axis}': 0.03 for axis in AXES}
-    head = device_files.head(calibration, content)
-    return {name: f'{head}# for autoware {node}, in place of its param file of this name;\n'
+    origin = device_files.origin_comment(calibration, content)
+    return {name: f'{origin}# for autoware {node}, in place of its param file of this name;\n'
             f'# {defaults} are its defaults, not measured here\n{parameter_block(values)}'
             for name, (node, defaults, values) in files.items()}
 
@@ -139,17 +137,16 @@ def _transform(calibration: Calibration, config: Config,
     ElementTree.SubElement(launch, 'node', pkg='tf2_ros', exec='static_transform_publisher',
                            name=name, args=text_formats.for_launch(words))
     not_set = '' if any(config.imu.lever_arm) else ' (not set)'
-    head = (f'{device_files.about(calibration, content)}\ntranslation: imu.lever_arm{not_set}; '
-            f'{not_estimated(calibration)} as configured')
+    note = (f'{device_files.origin_text(calibration, content)}\n'
+            f'translation: imu.lever_arm{not_set}; {not_estimated(calibration)} as configured')
     command = (text_formats.for_comment(
-        f'{head}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
+        f'{note}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
         'this command publishes;\n'
         'it is not the yaw_offset of navsat_transform, which corrects a compass.')
         + f'ros2 run tf2_ros static_transform_publisher {text_formats.for_shell(words)}\n')
     return {LAUNCH: '<?xml version="1.0"?>\n' + _xml(
-                launch, f'include it in the launch file of your vehicle\n{head}'),
-            URDF: _xml(joint, f'put into your URDF in place of the joint that carries the IMU\n'
-                              f'{head}'),
+                launch, f'include it in the launch file of your vehicle\n{note}'),
+            URDF: _xml(joint, 'put it into your URDF in place of the joint of the IMU\n' + note),
             COMMAND: command}
 
 
@@ -163,7 +160,7 @@ def _xml(root: Any, note: str) -> str:
 def with_imu_frame(calibration: Calibration, config: Config,
                    frame: str) -> tuple[Calibration, Config]:
     """Return result and settings with the frame of the IMU messages, unless it is configured."""
-    # frame is untrusted: a note states if it is replaced
+    # a frame from a bag is untrusted: a note states that it is replaced
     if config.frames.imu or not frame:
         return calibration, config
     valid = frame.lstrip('/')       # ROS 1 frames begin with /
@@ -178,9 +175,9 @@ def with_imu_frame(calibration: Calibration, config: Config,
 
 def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """Return file name -> text, empty if no leg has a track."""
-    # a file stays small with many legs: the tracks, three of each leg, share its points
-    tracks, file_points = 3 * max(1, len(calibration.legs)), 150_000
-    max_points = max(2, min(MAX_TRACK_POINTS, file_points // tracks))
+    # many legs share the points of a file, so that it stays small; a leg has three tracks
+    track_count, points_of_file = 3 * max(1, len(calibration.legs)), 150_000
+    max_points = max(2, min(MAX_TRACK_POINTS, points_of_file // track_count))
     shapes = [feature for n, leg in enumerate(calibration.legs, 1)
               for feature in features(n, leg, max_points)]
     if not shapes:
@@ -248,6 +245,7 @@ def _line(positions: Floats) -> dict[str, Any]:
 def _crossing(before: Floats, after: Floats) -> tuple[list[float], list[float]]:
     """Return the point on the 180th meridian between two points, on the side of each."""
     side = 180.0 if before[0] > 0 else -180.0
+    # longitude of ``after`` continued beyond the meridian: + 2 * side
     share = (side - before[0]) / (after[0] + 2 * side - before[0])
     others = (before[1:] + share * (after[1:] - before[1:])).round(DEGREE_PLACES).tolist()
     return [side, *others], [-side, *others]

@@ -55,7 +55,6 @@ class Stored:
 
 def read_stored(path: Path) -> Stored:
     """Return the calibration in a file or folder; BadUsage: missing, unreadable, other schema."""
-    path = Path(path)
     name = str(path)
     try:
         path = path / MAIN if path.is_dir() else path
@@ -87,21 +86,22 @@ def stored_from(content: dict[str, Any], name: str) -> Stored:
         raise ValueError(f'verdict is {verdict[:20]!r}')
     result = _entry(content, 'result', dict)
     legs = [leg for leg in _entry(content, 'legs', list) if isinstance(leg, dict)]
-    inputs = [i for i in _entry(content, 'inputs', list) if isinstance(i, dict)]
+    inputs = [bag for bag in _entry(content, 'inputs', list) if isinstance(bag, dict)]
     methods = _entry(content, 'methods', dict)
+    result = {key: entry for key, entry in result.items() if key not in NOT_ESTIMATES}
+    carried, imu = (read_carried(content[part]) if isinstance(content.get(part), dict) else None
+                    for part in ('carried', 'imu'))
     return Stored(
-        name, _entry(content, 'created', str), Verdict(verdict),
-        tuple(str(r.get('code')) for r in _entry(content, 'reasons', list) if isinstance(r, dict)),
-        {key: _estimate(entry, key) for key, entry in result.items() if key not in NOT_ESTIMATES},
-        frozenset((leg['start_ns'], leg['stop_ns']) for leg in legs
-                  if all(type(leg.get(k)) is int for k in ('start_ns', 'stop_ns'))),
-        frozenset(i['sha256'] for i in inputs if isinstance(i.get('sha256'), str)),
-        _entry(content, 'config', dict),
-        {key: _budget(methods, entry.get('method'), key) for key, entry in result.items()
-         if key not in NOT_ESTIMATES},
-        str(content.get('vehicle') or ''),
-        *(read_carried(content[part]) if isinstance(content.get(part), dict) else None
-          for part in ('carried', 'imu')))
+        name=name, created=_entry(content, 'created', str), verdict=Verdict(verdict),
+        reasons=tuple(str(reason.get('code')) for reason in _entry(content, 'reasons', list)
+                      if isinstance(reason, dict)),
+        estimates={key: _estimate(entry, key) for key, entry in result.items()},
+        legs=frozenset((leg['start_ns'], leg['stop_ns']) for leg in legs
+                       if all(type(leg.get(key)) is int for key in ('start_ns', 'stop_ns'))),
+        bags=frozenset(bag['sha256'] for bag in inputs if isinstance(bag.get('sha256'), str)),
+        config=_entry(content, 'config', dict),
+        budget={key: _budget(methods, entry.get('method'), key) for key, entry in result.items()},
+        vehicle=str(content.get('vehicle') or ''), carried=carried, imu=imu)
 
 
 def known_imu(config: Config) -> CarriedInformation | None:
@@ -157,16 +157,17 @@ def check_estimate(name: str, value: float | None, sigma: float | None) -> None:
         raise ValueError(f'result.{name}: its value is not positive')
 
 
-def _number(value: float | None, what: str) -> float | None:
+def _number(value: float | None, key: str) -> float | None:
+    """Return a finite number or None, or raise ValueError."""
     if value is None:
         return None
     try:
         if isinstance(value, bool) or not isinstance(value, (int, float)) \
                 or not math.isfinite(value):
-            raise ValueError(f'{what} is not a number')
+            raise ValueError(f'{key} is not a number')
         return float(value)
     except OverflowError:
-        raise ValueError(f'{what} is too large') from None
+        raise ValueError(f'{key} is too large') from None
 
 
 def _budget(methods: dict[str, dict[str, Any]], method: str | None,

@@ -10,7 +10,6 @@ import json
 import math
 import re
 import textwrap
-from typing import Any
 
 from odocal_ros.calib.number_text import relative_unit, significant
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
@@ -24,7 +23,7 @@ UNKNOWN = Estimate(None, None, '')
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 MAIN_VALUES = {'scale_factor': 'scale', **ANGLES}
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
-# definition: the space between a number and its unit, and in 't = 5'
+# definition: spaces that no line break replaces: before a unit, after ±, and in 't = 5'
 BEFORE_UNIT = re.compile(r'(?<=\d) (?=%|(?:deg|ppm|Hz|[ckm]?m|m?s|m/s)(?!\w))|(?<=±) '
                          r'|(?<=\bt) (?== )|(?<=\bt =) ')
 LEG_PREFIX = re.compile(r'leg (\d+): (.*)', re.DOTALL)
@@ -32,7 +31,7 @@ LEG_PREFIX = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
                signed: bool = False) -> str:
-    """Return value ± sigma times ``factor`` by the digits of sigma, such as -32000 ± 15000."""
+    """Return value ± sigma times ``factor``, with two digits of sigma: '-32000 ± 15000'."""
     if value is None or not math.isfinite(value):
         return 'unknown'
     value *= factor
@@ -40,7 +39,7 @@ def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
         return f'{value:+.6g}' if signed else f'{value:.6g}'
     sigma *= factor
     places = 1 - math.floor(math.log10(sigma)) if 0 < sigma < math.inf else 6
-    if sigma >= 100:
+    if sigma >= 100:      # negative places: round digits before the point
         value, sigma = round(value, places), round(sigma, places)
     places = max(0, min(12, places))
     return f'{value:{"+" if signed else ""}z.{places}f} ± {sigma:.{places}f}'
@@ -92,7 +91,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def wrapped(text: str, indent: str = '  ', hanging: str = '  ', width: int = WIDTH) -> list[str]:
-    """Return a text in lines; all but the first have the hanging indent; units stay at numbers."""
+    """Return a text as lines, all but the first with ``hanging``; units stay at their numbers."""
     lines = textwrap.wrap(BEFORE_UNIT.sub('\xa0', text), width, initial_indent=indent,
                           subsequent_indent=indent + hanging, break_long_words=False,
                           break_on_hyphens=False)
@@ -130,59 +129,59 @@ def table_lines(rows: Sequence[Sequence[str]], indent: str = '  ') -> list[str]:
 
 def table_row(cells: Sequence[str], widths: Sequence[int]) -> str:
     """Return a line of a table of fixed widths: name left-aligned, numbers right-aligned."""
-    name, *numbers = (f'{cell:{"<" if not k else ">"}{width}}' for k, (cell, width) in enumerate(
-        zip(cells, widths, strict=True)))
-    return f'  {name}{"".join(numbers)}'
+    numbers = ''.join(map(str.rjust, cells[1:], widths[1:]))
+    return f'  {cells[0]:<{widths[0]}}{numbers}'
 
 
 def join_same_reasons(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
     """Return reasons; those of several legs that differ only in the leg are joined."""
-    joined: dict[tuple[Any, ...], list[str]] = {}
+    # (reason without the leg in its text, True if it is of a leg) -> numbers of its legs
+    legs_by_reason: dict[tuple[Reason, bool], list[int]] = {}
     for reason in reasons:
-        match = LEG_PREFIX.fullmatch(reason.text)
-        number, text = match.groups() if match else ('', reason.text)
-        joined.setdefault((replace(reason, text=text), bool(match)), []).append(number)
-    by_code: dict[object, list[tuple[Reason, list[str]]]] = {}
-    for (reason, has_leg), numbers in joined.items():
-        by_code.setdefault(reason.code if has_leg else reason, []).append((reason, numbers))
+        if match := LEG_PREFIX.fullmatch(reason.text):
+            legs_by_reason.setdefault((replace(reason, text=match[2]), True), []).append(
+                int(match[1]))
+        else:
+            legs_by_reason[reason, False] = []
+    by_code: dict[object, list[tuple[Reason, list[int]]]] = {}
+    for (reason, _), legs in legs_by_reason.items():
+        by_code.setdefault(reason.code if legs else reason, []).append((reason, legs))
     return tuple(reason for group in by_code.values() for reason in _name_legs(group))
 
 
-def _name_legs(group: list[tuple[Reason, list[str]]]) -> list[Reason]:
+def _name_legs(group: list[tuple[Reason, list[int]]]) -> list[Reason]:
     """Return reasons of one code, (reason, leg numbers), with the legs in their texts."""
-    reason, numbers = group[0]
-    if not numbers[0]:
-        return [reason]
-    max_listed = 2    # different texts of a code; if there are more, the first one is shown
-    if len(group) <= max_listed:
-        return [replace(one, text=f'{_legs_text(legs)}: {one.text}') for one, legs in group]
-    all_legs = sorted({int(n) for _, legs in group for n in legs})
-    return [replace(reason, text=f'{_legs_text(list(map(str, all_legs)))}; of leg {numbers[0]}: '
-                                 f'{reason.text}')]
+    first_reason, first_legs = group[0]
+    if not first_legs:
+        return [first_reason]
+    max_texts = 2    # different texts of a code; if there are more, the first one is shown
+    if len(group) <= max_texts:
+        return [replace(reason, text=f'{_legs_text(legs)}: {reason.text}')
+                for reason, legs in group]
+    all_legs = sorted({number for _, legs in group for number in legs})
+    return [replace(first_reason, text=f'{_legs_text(all_legs)}; of leg {first_legs[0]}: '
+                                       f'{first_reason.text}')]
 
 
-def _legs_text(numbers: list[str]) -> str:
-    """Return increasing leg numbers as text."""
-    if len(numbers) == 1:
-        return f'leg {numbers[0]}'
-    consecutive: list[list[str]] = []
+def _legs_text(numbers: Sequence[int]) -> str:
+    """Return increasing leg numbers as text, such as 'legs 1 to 3 and 5'."""
+    ranges: list[list[int]] = []
     for number in numbers:
-        if consecutive and int(number) == int(consecutive[-1][-1]) + 1:
-            consecutive[-1].append(number)
+        if ranges and number == ranges[-1][-1] + 1:
+            ranges[-1].append(number)
         else:
-            consecutive.append([number])
-    ranges = [word for group in consecutive
-              for word in (group if len(group) < 3 else [f'{group[0]} to {group[-1]}'])]
-    if len(ranges) == 1:
-        return f'legs {ranges[0]}'
-    return f'legs {", ".join(ranges[:-1])} and {ranges[-1]}'
+            ranges.append([number])
+    words = [word for group in ranges for word in (
+        map(str, group) if len(group) < 3 else [f'{group[0]} to {group[-1]}'])]
+    before_last = f'{", ".join(words[:-1])} and ' * (len(words) > 1)
+    return f'leg{"s" * (len(numbers) > 1)} {before_last}{words[-1]}'
 
 
 def lines_of_bags(legs: tuple[LegResult, ...], width: int) -> list[str]:
     """Return the text that lists the legs of each bag, empty for a single bag."""
-    legs_by_bag: dict[str, list[str]] = {}
+    legs_by_bag: dict[str, list[int]] = {}
     for number, leg in enumerate(legs, 1):
-        legs_by_bag.setdefault(leg.bag, []).append(str(number))
+        legs_by_bag.setdefault(leg.bag, []).append(number)
     if len(legs_by_bag) < 2:
         return []
     listed = '; '.join(f'{_legs_text(numbers)}: {bag}' for bag, numbers in legs_by_bag.items())
@@ -199,9 +198,8 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool) -> list[s
             codes = ', '.join(dict.fromkeys(r.code.name for r in group))
             lines += wrapped(f'notes, see the report: {codes}', '  ', '   ', width)
             continue
+        lines += [f'  {title}'] * bool(group)
         for reason in group:
-            lines += [f'  {title}'] if title else []
-            title = ''
             lines += wrapped(str(reason), '    ', '   ', width)
             lines += wrapped(f'-> {reason.remedy}', '      ', '   ', width)
     if any(re.search(r'\bt = ', line) for line in lines):

@@ -17,7 +17,7 @@ GAP = Reason(Code.TOPIC_GAP, 'odometer gap of 1.2 s at t = 3.1 s')
 def texts(calibration, **changes):
     """Return the files for other programs by name; changes of settings as group__name."""
     config = with_settings(Config(), {k.replace('__', '.'): v for k, v in changes.items()})
-    return program_files.texts(calibration, config, as_json(calibration, config, [], CREATED))
+    return program_files.file_texts(calibration, config, as_json(calibration, config, [], CREATED))
 
 
 def with_estimates(calibration, **changed):

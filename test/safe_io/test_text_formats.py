@@ -44,7 +44,7 @@ def texts(frame='imu_link', bag='drive', config=None):
     made, config = with_imu_frame(calibration(), config or Config(), frame)
     inputs = [{'bag': bag, 'sha256': None, 'topics': {}}]
     content = as_json(made, config, inputs, '2026-01-02T03:04:05+00:00')
-    return made, program_files.texts(made, config, content)
+    return made, program_files.file_texts(made, config, content)
 
 
 @pytest.mark.parametrize('frame', ATTACKS)
