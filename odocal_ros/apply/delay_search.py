@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Delay of the IMU relative to the odometer, by the acceleration in a stream."""
+"""Estimate of the delay of the IMU relative to the odometer, by accelerations in a stream."""
 
 from collections import deque
 
@@ -11,9 +11,9 @@ from odocal_ros.apply.attitude import Vector
 from odocal_ros.apply.errors import GRAVITY
 from odocal_ros.data.arrays import Floats
 
-# judgement: least and largest number of rows of the regression, one per second; s, correlation of
-# residuals
-MIN_DELAY_ROWS, MAX_DELAY_ROWS, LAGS = 60, 300, 4
+# judgement: least and largest number of rows of the regression, one per second; rows over which
+# residuals are correlated
+MIN_DELAY_ROWS, MAX_DELAY_ROWS, CORRELATED_ROWS = 60, 300, 4
 # judgement: least delay that is reported, s and sigmas. 168 simulated drives without a delay had
 # up to 0.028 s and 2.5 sigmas at their ends; none of 60 others reported one in any second
 MIN_DELAY, DELAY_SIGMAS = 0.04, 4.0
@@ -46,8 +46,8 @@ class DelaySearch:
         """
         Add a second of data; return a note if ``sigma_s`` has increased, else ''.
 
-        forward_n : forward axis.   change_n : (3,) m/s, change of velocity by the odometer, None
-        if not usable.   dv_n : m/s, integral of the specific force.   T : s.
+        forward_n : (3,) forward axis.   change_n : (3,) m/s, change of velocity by the odometer,
+        None if not usable.   dv_n : (3,) m/s, integral of the specific force.   T : s.
         """
         if change_n is None:
             self._recent_changes.clear()
@@ -82,8 +82,8 @@ class DelaySearch:
         scores = X * residuals[:, None]
         # residuals are correlated: Newey-West covariance
         middle = scores.T @ scores
-        for lag in range(1, LAGS):
-            lagged = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)
+        for lag in range(1, CORRELATED_ROWS):
+            lagged = scores[lag:].T @ scores[:-lag] * (1 - lag / CORRELATED_ROWS)
             middle += lagged + lagged.T
         C = np.linalg.inv(N)
         white_variance = np.sum(residuals**2) / (len(y) - 2) * C[0, 0]

@@ -25,12 +25,12 @@ from odocal_ros.settings.nominal import Grade
 P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 # definition: of scale, mounting (pitch, yaw) and gyro scale; number of errors
 K, M, G, N = 12, slice(13, 15), 15, 16
-BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # definition: errors that gravity corrects; heading is not
-BY_REST = np.r_[3:9]                # definition: errors that a turn rate at rest corrects
-# definition: the same as index arrays, for entries of the diagonal
+# definition: indices of errors that gravity corrects (not heading), and a turn rate at rest
+GRAVITY_ERRORS, REST_ERRORS = [3, 4, 6, 7, 9, 10], np.r_[3:9]
+# definition: P, PHI, BG and all as index arrays, for entries of the diagonal
 POSITIONS, ROTATIONS, BIASES, ALL = np.r_[P], np.r_[PHI], np.r_[BG], np.arange(N)
 EYE, AXES = np.eye(N), np.eye(3)
-POSE = np.eye(6, N)       # definition: position and attitude of the IMU in the error state
+POSE_JACOBIAN = np.eye(6, N)       # definition: position and attitude of the IMU by error state
 PROPAGATION_PERIOD = 0.05      # s, judgement: between propagations of the covariance
 # judgement: m/sqrt(m), slip and sideslip: along, left, up
 SLIP_PER_METRE = (0.005, 0.01, 0.01)
@@ -53,11 +53,11 @@ class Errors:
     """
     Covariance of the errors, (16, 16), and its updates by gravity and at standstill.
 
-    Arguments: grade : of the IMU.   tilt_sigma, bias_sigma : rad, rad/s, at the start.
-    earth_in_bias : True if the gyro bias contains the Earth rate.
+    grade : of the IMU.   tilt_sigma, bias_sigma : rad, rad/s, at the start.   earth_in_bias : True
+    if the gyro bias contains the Earth rate.
 
     Attributes: shortening : (3,) m in n, second-order effect of attitude errors on the position.
-    changed : True if the covariance has changed since the last ``pose_and_twist``.
+    has_changed : True if the covariance has changed since the last ``pose_and_twist``.
     """
 
     def __init__(self, grade: Grade, vehicle: Vehicle, tilt_sigma: float,
@@ -75,7 +75,7 @@ class Errors:
             np.full(3, grade.accel_bias), [vehicle.scale_sigma, vehicle.pitch_sigma,
                                            vehicle.yaw_sigma, grade.gyro_scale_sigma]])
         self.cov[ALL, ALL] = sigma**2
-        self.shortening, self.changed = ZERO, True
+        self.shortening, self.has_changed = ZERO, True
         # x of odom is the vehicle's forward axis at the start: the attitude has the error of the
         # mounting yaw with opposite sign
         self.cov[5, 5] = vehicle.yaw_sigma**2
@@ -86,8 +86,9 @@ class Errors:
         """
         Add an interval; propagate every PROPAGATION_PERIOD, or at once if data are uncertain.
 
-        T : s.   C_nb : at its end.   travel_n, turn_n : (3,) m, (3,) rad.   travel_variance :
-        m^2, of uncertain travel.   gaps : s, parts of the interval without IMU data.
+        T : s.   C_nb : (3, 3), at its end.   travel_n, turn_n : (3,) m, (3,) rad.
+        travel_variance : m^2, of travel that is not measured.   gaps : s, parts of the interval
+        without IMU data.
         """
         self._pending_s += T
         self._pending_travel = add_scaled(self._pending_travel, travel_n)
@@ -116,7 +117,7 @@ class Errors:
             cov[P, P] += cross @ cross.T * turn_sigma**2
         cov[ALL, ALL] += self._walks * T
         cov[ROTATIONS, ROTATIONS] += turn_sigma**2
-        self.cov, self.changed = cov, True
+        self.cov, self.has_changed = cov, True
 
     @staticmethod
     def slip_variances(path_length: float) -> Vector:
@@ -127,12 +128,12 @@ class Errors:
     def add_travel(self, path_length: float) -> None:
         """Add the variance of travel, m, in an unknown direction."""
         self.cov[POSITIONS, POSITIONS] += path_length**2
-        self.changed = True
+        self.has_changed = True
 
     def add_turn(self, variance: Floats) -> None:
         """Add the variance of an unknown turn, (3, 3) rad^2 in n, at most half a turn."""
         self.cov[PHI, PHI] += variance / max(1.0, float(np.trace(variance)) / np.pi**2)
-        self.changed = True
+        self.has_changed = True
 
     def correct_by_gravity(self, C_nb: Floats, residual_n: Floats, T: float,
                            sigma: float) -> Floats | None:
@@ -156,7 +157,7 @@ class Errors:
             sigma = max(sigma, DRIVING_FORCE)
             if not (residual_n[:2]**2 < FAULT_SIGMAS**2 * (explained + sigma**2)).all():
                 return None
-        return self._correction(H, residual_n[:2], np.eye(2) * (noise + sigma**2), BY_GRAVITY)
+        return self._correction(H, residual_n[:2], np.eye(2) * (noise + sigma**2), GRAVITY_ERRORS)
 
     def correct_by_rest(self, rate_b: Floats, variance: Floats) -> Floats:
         """
@@ -165,19 +166,19 @@ class Errors:
         If the rate exceeds its limit, the variance of the bias is increased first.
         """
         H = np.zeros((3, N))
-        H[:, BG] = np.eye(3)
+        H[:, BG] = AXES
         is_inconsistent = rate_b**2 > FAULT_SIGMAS**2 * (np.diag(self.cov)[BG] + variance)
         self.cov[BIASES, BIASES] += np.where(is_inconsistent, rate_b**2, 0.0)
-        return self._correction(H, rate_b, np.diag(variance), BY_REST)
+        return self._correction(H, rate_b, np.diag(variance), REST_ERRORS)
 
-    def _correction(self, H: Floats, z: Floats, R: Floats, observed: list[int] | Ints) -> Floats:
-        """Return the Kalman correction by z = H x with covariance R; others are not corrected."""
+    def _correction(self, H: Floats, z: Floats, R: Floats, corrected: list[int] | Ints) -> Floats:
+        """Return the Kalman correction, (16,), by z = H x with covariance R; others remain 0."""
         cov = self.cov
         S = H @ cov @ H.T + R
         gain = np.zeros((N, len(z)))
-        gain[observed] = np.linalg.solve(S, H @ cov)[:, observed].T
-        I_KH = np.eye(N) - gain @ H      # Joseph's form, valid for any gain
-        self.cov, self.changed = I_KH @ cov @ I_KH.T + gain @ R @ gain.T, True
+        gain[corrected] = np.linalg.solve(S, H @ cov)[:, corrected].T
+        I_KH = EYE - gain @ H      # Joseph's form, valid for any gain
+        self.cov, self.has_changed = I_KH @ cov @ I_KH.T + gain @ R @ gain.T, True
         return gain @ z
 
     def pose_and_twist(self, C_nb: Matrix, arm_n: Vector, twist_b: Floats, T: float) -> Floats:
@@ -188,7 +189,7 @@ class Errors:
         to the point of the pose.   twist_b : (6, 3), turn rate in b to twist.   T : s, duration of
         the mean twist.
         """
-        J = POSE.copy()
+        J = POSE_JACOBIAN.copy()
         J[3:, M] = [row[1:] for row in C_nb]
         J[:3, 3:] = -cross_matrix(arm_n) @ J[3:, 3:]
         pose = J @ self.cov @ J.T
@@ -197,7 +198,7 @@ class Errors:
         a, b, c = self.cov[ROTATIONS, ROTATIONS].tolist()
         pose[ROTATIONS, ROTATIONS] += [b * c / 4, a * c / 4, a * b / 4]
         twist = twist_b @ (self.cov[BG, BG] + AXES * (self.grade.gyro_noise**2 / T)) @ twist_b.T
-        self.changed = False
+        self.has_changed = False
         return np.stack([pose, twist])
 
 

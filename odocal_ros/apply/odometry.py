@@ -4,7 +4,7 @@
 """
 Odometry of a stream: from samples, block by block, to poses with covariances.
 
-Samples are screened; the start gives attitude and gyro bias; dead reckoning continues from there.
+The stamps are tested; the start gives attitude and gyro bias; dead reckoning continues from there.
 If the path cannot be continued, it restarts at its origin, with a note.
 """
 
@@ -47,8 +47,8 @@ class Odometry:
     def __init__(self, vehicle: Vehicle, config: ApplyConfig) -> None:
         self.vehicle, self.config = vehicle, config
         self.grade = grade_of(config.imu)
-        self.restarts = 0         # number of restarts
-        self._first_lead_s: float | None = None      # lead of the odometer's clock at first
+        self.restarts = 0      # number so far
+        self._first_lead_s: float | None = None      # ``_odometer_lead_s`` at the first start
         self._notes: list[str] = []
         self._reset()
 

@@ -4,7 +4,8 @@
 """
 Poses and twists of the odometry, with their covariances, as the floats of nav_msgs/Odometry.
 
-They are packed as in a message, since setting the fields of a message object takes longer.
+In: numbers and covariances of dead reckoning. Out: their bytes as in a message, since setting the
+fields of a message object takes longer.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ from odocal_ros.settings.levels import SWAY
 
 # format: floats of nav_msgs/Odometry; those of pose and twist before their covariances
 NUMBERS, POSE_MEAN, TWIST_MEAN = struct.Struct('<85d'), struct.Struct('<7d'), struct.Struct('<6d')
-TWIST = 43 * 8         # format: byte of the twist
+TWIST_OFFSET = 43 * 8     # format: bytes before the twist
 ZEROS = (0.0,) * 6      # definition
 
 
@@ -85,29 +86,34 @@ def pack_pose(position: Vector, q: Quaternion, twist: Sequence[float],
     return POSE_MEAN.pack(*position, *q) + pose_cov + TWIST_MEAN.pack(*twist) + twist_cov
 
 
-def covariances(from_errors: Floats, by_delay: Sequence[float], along_n: Sequence[float],
-                twist_by_turn: Sequence[float], variances: Sequence[float]) -> list[bytes]:
+def covariances(error_covariances: Floats, delay_effect: Sequence[float],
+                travel_effect_n: Sequence[float], gyro_scale_effect: Sequence[float],
+                velocity_variances: Sequence[float]) -> list[bytes]:
     """
     Return the covariances of pose and twist, (6, 6) each, as in a message.
 
-    from_errors : (2, 6, 6), by the error state.   by_delay : (6,) effect of one sigma of the delay
-    on the pose.   along_n : (3,) m, one sigma of the travel.   twist_by_turn : (6,) effect of one
-    sigma of the gyro scale on the twist.   variances : (3,) of the velocity, (m/s)^2.
+    error_covariances : (2, 6, 6), by the error state.   delay_effect : (6,) of one sigma of the
+    delay on the pose.   travel_effect_n : (3,) m, of one sigma of the travel on the position.
+    gyro_scale_effect : (6,) of one sigma of the gyro scale on the twist.   velocity_variances :
+    (3,) (m/s)^2.
     """
-    x, y, z = map(math.sqrt, variances)
-    effects = np.array([[by_delay, (*along_n, *ZEROS[3:]), ZEROS, ZEROS],
-                        [twist_by_turn, (x, *ZEROS[1:]), (0.0, y, *ZEROS[2:]),
+    x, y, z = map(math.sqrt, velocity_variances)
+    # the effects of independent errors on pose and twist, four rows each: (2, 4, 6)
+    effects = np.array([[delay_effect, (*travel_effect_n, *ZEROS[3:]), ZEROS, ZEROS],
+                        [gyro_scale_effect, (x, *ZEROS[1:]), (0.0, y, *ZEROS[2:]),
                          (0.0, 0.0, z, *ZEROS[3:])]])
-    return [cov.tobytes() for cov in from_errors + effects.swapaxes(1, 2) @ effects]
+    return [cov.tobytes() for cov in error_covariances + effects.swapaxes(1, 2) @ effects]
 
 
-def velocity_variances(vehicle: Vehicle, speed: float, T: float, travel: float) -> Vector:
+def mean_velocity_variances(vehicle: Vehicle, speed: float, T: float,
+                            travel_variance: float) -> Vector:
     """
     Return the variances of the mean velocity of base_link over T s, (m/s)^2.
 
-    speed : m/s, of the odometer's point.   travel : m^2, variance of the travel in T s, without
-    those of scale and slip.
+    speed : m/s, of the odometer's point.   travel_variance : m^2, in T s, without those of scale
+    and slip.
     """
     along, left, up = (variance / T for variance in Errors.slip_variances(speed))
-    along += (speed * vehicle.scale_sigma)**2 + travel / T**2 + 1e-6
+    # at least 1 mm/s
+    along += (speed * vehicle.scale_sigma)**2 + travel_variance / T**2 + 1e-6
     return along, left + SWAY**2, up + SWAY**2

@@ -5,12 +5,14 @@
 Sampling times of the rows of a counter, without the jitter of their arrival.
 
 Most counters have no stamp, or one of their arrival, but are sampled evenly. In: arrival time and
-travel of each row. Out: its time on a line (row number to time), if travel is smoother with it.
+travel of each row. Out: its time on a line through (row number, time), if the travel is smoother
+with it than with that of its arrival.
 """
 
 from bisect import bisect_left
 from collections import deque
 import math
+from typing import NamedTuple
 
 from odocal_ros.screening.even_imu_times import MIN_STEP
 from odocal_ros.screening.late_rows import MIN_JITTER
@@ -33,6 +35,14 @@ LONG_GAP = 1.0             # s; judgement: gap with lost rows at a slow wheel
 MAX_LOST_INTERVALS = 5     # judgement: largest gap, in intervals, over which the line continues
 
 
+class TimedRow(NamedTuple):
+    """A row with both of its times, s, and the travel up to it, m."""
+
+    arrival: float
+    line_time: float
+    travel: float
+
+
 class RowTimes:
     """
     Estimate of the sampling times of one counter, row by row.
@@ -47,8 +57,8 @@ class RowTimes:
     def __init__(self) -> None:
         self._line_is_smoother = True           # roughness is not larger on the line
         self.error_s = 0.0
-        self._t = -math.inf                     # s, time of the last row
-        self._rows: deque[tuple[float, float, float]] = deque(maxlen=3)  # arrival, line, travel
+        self._t = -math.inf                     # s, returned for the last row
+        self._rows: deque[TimedRow] = deque(maxlen=3)
         self._roughness = [0.0, 0.0]               # with arrival times; with those of the line
         self._rounding_variance = self._square_speed = 0.0      # means: m^2, of a count; (m/s)^2
         self._mean_rows = 0                     # number of rows in these means
@@ -64,7 +74,8 @@ class RowTimes:
         self._last_step = 0.0           # m, travel in the last interval
         self._hull: list[tuple[int, float]] = []      # rows and arrivals below all others
         self._late_at_rest: list[float] = []     # s, lateness of consecutive rows at rest
-        self._before_loss = (0, 0.0, 1.0)    # row, its time, interval before the assumed lost rows
+        # before the rows that are assumed lost: number and time, s, of the last row; interval, s
+        self._row_before, self._t_before, self._interval_before = 0, 0.0, 1.0
 
     def next_time(self, t: float, travel: float, speed: float, quantum: float) -> float:
         """
@@ -73,32 +84,31 @@ class RowTimes:
         t : arrival, s.   travel : up to this row, m.   speed : m/s.   quantum : m, of a count.
         """
         expected = max(abs(speed) * self._interval, self._last_step) if speed else 0.0
-        step = abs(travel - self._rows[-1][2]) if self._rows else 0.0
+        step = abs(travel - self._rows[-1].travel) if self._rows else 0.0
         is_reliable = expected > max(RELIABLE_COUNTS * quantum, RELIABLE_SPEED * self._interval)
-        moves = 0 < step <= 2 * RELIABLE_COUNTS * quantum
-        if not is_reliable and t - self._line > LONG_GAP and not moves:
+        moves_slowly = 0 < step <= 2 * RELIABLE_COUNTS * quantum
+        if not is_reliable and t - self._line > LONG_GAP and not moves_slowly:
             self._restart()      # lost rows; late ones arrive one after the other
         self._advance_line(t, step, expected if is_reliable else 0.0)
-        self._rows.append((t, self._line if self._count else t, travel))
+        self._rows.append(TimedRow(t, self._line if self._count else t, travel))
         if len(self._rows) == 3:
             self._compare_roughness(quantum)
-        row_time = self._rows[-1][1] if self._in_use() else t
+        row_time = self._rows[-1].line_time if self._line_is_used() else t
         self._t = max(row_time, self._t + MIN_STEP, math.nextafter(self._t, math.inf))
         return self._t
 
     @property
     def delay_sigma_s(self) -> float:
         """Return the sigma of the delay that all times have in common, s."""
-        return DELAY_SIGMA * self._mean_delay if self._in_use() else 0.0
+        return DELAY_SIGMA * self._mean_delay if self._line_is_used() else 0.0
 
     @property
     def rate_error(self) -> float:
         """Return the relative sigma of the interval between rows."""
-        if not self._in_use():
-            return 0.0
-        return DELAY_SIGMA * self._mean_delay / (self._row - self._hull[0][0]) / self._interval
+        return (DELAY_SIGMA * self._mean_delay / (self._row - self._hull[0][0]) / self._interval
+                if self._line_is_used() else 0.0)
 
-    def _in_use(self) -> bool:
+    def _line_is_used(self) -> bool:
         return (self._line_is_smoother and self._mean_delay > MIN_JITTER
                 and self._count > FIRST_ROWS)
 
@@ -132,12 +142,12 @@ class RowTimes:
         again, they were only late: then the number is negative.
         """
         if self._assumed_lost:
-            row, t_before, interval = self._before_loss
-            received = self._row + 1 - self._assumed_lost - row
-            min_lost = round((t - t_before) / interval) - received
+            received = self._row + 1 - self._assumed_lost - self._row_before
+            min_lost = round((t - self._t_before) / self._interval_before) - received
             only_late = min(self._assumed_lost, max(self._assumed_lost - min_lost, 0))
-            self._hull = [(r - only_late if r > row else r, s) for r, s in self._hull]
-            is_tested = self._row - row < TESTED_LOST_ROWS
+            self._hull = [(row - only_late if row > self._row_before else row, arrival)
+                          for row, arrival in self._hull]
+            is_tested = self._row - self._row_before < TESTED_LOST_ROWS
             self._assumed_lost = self._assumed_lost - only_late if is_tested else 0
             if only_late:
                 return -only_late
@@ -150,13 +160,15 @@ class RowTimes:
         lost = round(min(self._late_at_rest) / self._interval)
         self._late_at_rest.clear()
         if not self._assumed_lost:
-            self._before_loss = self._row, self._line, self._interval
+            self._row_before, self._t_before = self._row, self._line
+            self._interval_before = self._interval
         self._assumed_lost += lost
         return lost
 
     def _fit_line(self, t: float) -> None:
         """Add the row to the hull; the line is its edge at the middle of the rows."""
         hull, row = self._hull, self._row
+        # drop points above the edge from the point before them to the new row (monotone chain)
         while len(hull) > 1 and (t - hull[-2][1]) * (hull[-1][0] - hull[-2][0]) <= (
                 hull[-1][1] - hull[-2][1]) * (row - hull[-2][0]):
             hull.pop()
@@ -164,6 +176,7 @@ class RowTimes:
         if len(hull) > 2 and row - hull[1][0] > LINE_ROWS:
             del hull[0]
         if len(hull) > 1:
+            # the first point at or after the middle row ends the edge
             end = max(bisect_left(hull, ((row + hull[0][0]) / 2, 0.0)), 1)
             (row0, t0), (row1, t1) = hull[end - 1:end + 1]
             self._interval = (t1 - t0) / (row1 - row0)
@@ -171,7 +184,7 @@ class RowTimes:
 
     def _compare_roughness(self, quantum: float) -> None:
         """Update the roughness of the travel at arrival and on the line, and ``error_s``."""
-        (t0, p0, s0), (t1, p1, s1), (t2, p2, s2) = self._rows
+        (t0, p0, s0), (t1, p1, s1), (t2, p2, s2) = self._rows      # arrival, line, travel
         if self._count <= FIRST_ROWS or abs(s2 - s0) <= 2 * RELIABLE_COUNTS * quantum:
             return
         self._mean_rows += 1
@@ -186,8 +199,9 @@ class RowTimes:
         is_known = self._mean_rows > FIRST_ROWS
         self._line_is_smoother = not is_known or (
             self._roughness[1] <= limit**2 * self._roughness[0])
-        # a time error sigma causes a deviation from the mean of both neighbours of sqrt(1.5) sigma
-        variance = max(self._roughness[self._in_use()] / 1.5 - self._rounding_variance, 0.0)
+        # roughness with the times in use; a time error sigma causes a deviation from the mean of
+        # both neighbours of sqrt(1.5) sigma
+        variance = max(self._roughness[self._line_is_used()] / 1.5 - self._rounding_variance, 0.0)
         self.error_s = math.sqrt(variance / max(self._square_speed, MIN_STEP))
         if not is_known:       # times of arrival may be correct
             self.error_s = max(self.error_s, DELAY_SIGMA * self._mean_delay)

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Test of the stamps of a topic by their arrival times: false stamps, clocks that were set."""
+"""
+Test of the stamps of a topic by their arrival times: false stamps, clocks that were set.
+
+In: rows in order of arrival. Out: the rows with a usable stamp, and steps of the sender's clock.
+"""
 
 from collections import deque
 from collections.abc import Sequence
@@ -38,14 +42,14 @@ class StampScreen:
         self.lag_ns: float | None = None      # least lag
         self._refused_rows = 0        # consecutive ones
         self._newest_ns = 0           # newest usable stamp
-        self._first: tuple[int, int] | None = None      # stamp and arrival, ns
-        self._real_time = True        # False: a bag is played faster or slower
+        self._first_row: tuple[int, int] | None = None      # its stamp and arrival, ns
+        self._is_real_time = True     # False: a bag is played faster or slower
         self._median_lag_ns = 0.0     # running median of the lags
         self._lags: deque[int] = deque(maxlen=PERMANENT_ROWS)
 
     def clock_step_s(self, rows: int) -> float:
         """Return the shift of the lag of the last rows, s; 0 if any is within MIN_STEP_S."""
-        if len(self._lags) < rows or not self._real_time or (
+        if len(self._lags) < rows or not self._is_real_time or (
                 abs(self._lags[-1] - self._median_lag_ns) * 1e-9 <= MIN_STEP_S):
             return 0.0
         last = list(self._lags)[-rows:]
@@ -56,25 +60,26 @@ class StampScreen:
 
     def select_usable(self, rows: Sequence[Reading]) -> list[Reading]:
         """Return the rows of the next block with a usable stamp."""
-        accepted: list[Reading] = []
+        usable_rows: list[Reading] = []
         self.jump_row = self.dropped = 0
         for k, row in enumerate(rows):
-            stamp, received = row[:2]
+            stamp, received = row[:2]      # ns
             if not 0 < stamp < LATEST_STAMP_NS:
                 self.dropped += 1
                 continue
             lag = received - stamp
             lead_ns = 0.0 if self.lag_ns is None else self.lag_ns - lag
             age_ns = self._newest_ns - stamp
-            if lead_ns > STAMP_LIMIT_NS * self.rate or age_ns > STAMP_LIMIT_NS:
-                self.jump_row = self.jump_row if self._refused_rows else k
+            if lead_ns > STAMP_LIMIT_NS * self.rate or age_ns > STAMP_LIMIT_NS:      # it is false
+                if not self._refused_rows:
+                    self.jump_row = k
                 self._refused_rows += 1
                 self.dropped += age_ns != 0      # a repeated row is no fault
                 self.excess_s = (-age_ns if age_ns > STAMP_LIMIT_NS else lead_ns) * 1e-9
                 self.clock_jumped |= self._refused_rows >= CLOCK_SET_ROWS
             elif age_ns < 0:
                 self._refused_rows, self._newest_ns = 0, stamp
-                accepted.append(row)
+                usable_rows.append(row)
                 if self.lag_ns is None or lead_ns > 0:
                     self.lag_ns = lag
                 else:
@@ -84,7 +89,7 @@ class StampScreen:
             if not self._refused_rows:
                 self._update_median_lag(lag)
         self._update_rate(rows[-1][1] if rows else 0)
-        return accepted
+        return usable_rows
 
     def _update_median_lag(self, lag: int) -> None:
         """Update the running median by a lag, ns; it changes slowly, as two clocks drift."""
@@ -94,9 +99,9 @@ class StampScreen:
 
     def _update_rate(self, received_ns: int) -> None:
         """Update the rate of the stamps since the first block: the speed of a played bag."""
-        if self._first is None:
-            self._first = (self._newest_ns, received_ns) if self._newest_ns else None
-        elif received_ns > self._first[1]:
-            rate = (self._newest_ns - self._first[0]) / (received_ns - self._first[1])
-            self._real_time = abs(rate - 1) < REAL_TIME_TOLERANCE
+        if self._first_row is None:
+            self._first_row = (self._newest_ns, received_ns) if self._newest_ns else None
+        elif received_ns > self._first_row[1]:
+            rate = (self._newest_ns - self._first_row[0]) / (received_ns - self._first_row[1])
+            self._is_real_time = abs(rate - 1) < REAL_TIME_TOLERANCE
             self.rate = rate if rate > FAST_PLAY else 1.0

@@ -4,15 +4,17 @@
 """
 The IMU rows of a stream that dead reckoning still needs, without spikes and isolated outliers.
 
-A leg is screened as a whole (``screening/glitches.py``). In a stream, a row is tested with earlier
-rows, and with later ones up to the longest duration of a spike; the limits are those of a leg. A
-block has two or three rows, so numbers are faster than numpy arrays.
+In: IMU messages. Out: rows in b, with the part of the turn rate that is implausible. A leg is
+screened as a whole (``screening/glitches.py``). In a stream, a row is tested with earlier ones,
+and later ones up to the longest duration of a spike; the limits are those of a leg. A block has
+two or three rows, so numbers are faster than numpy arrays.
 """
 
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
+import math
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -26,7 +28,7 @@ INTERVAL_ROWS = 64      # judgement: rows of the median interval
 IMU_GAP_INTERVALS = 2.5      # judgement: median intervals; in a longer gap a turn is not measured
 # physical: twice the range of common gyros, 2000 deg/s; range of accelerometers for crashes, 200 g
 MAX_TURN, MAX_FORCE = 70.0, 2000.0      # rad/s, m/s^2
-USUAL_ROWS = 50           # judgement: rows of the mean step
+MEAN_STEP_ROWS = 50       # judgement: averaging length of the mean step
 FROZEN_TIME = 0.1         # s; judgement: rows that are equal for longer are frozen
 TURN_CHANGE = 10.0        # rad/s^2; physical: limit for a vehicle, except over a stone
 IMPLAUSIBLE_TIME = 1.0    # s; judgement: a longer turn after a step is real
@@ -35,22 +37,17 @@ OUTLIER_LIMITS = (glitches.SINGLE_TURN,) * 3 + (glitches.SINGLE_FORCE,) * 3
 OUTLIER_ROWS = glitches.NEIGHBOUR_ROWS + 4      # definition: rows that ``is_outlier`` uses
 
 
-class Row(NamedTuple):
-    """
-    A row of the IMU.
+class ImuRow(NamedTuple):
+    """A row of the IMU."""
 
-    t : s since the first.   w_b, f_b : rad/s, m/s^2; NO_FORCE: no force published.
-    implausible : rad/s, implausible part of the turn rate.
-    """
-
-    t: float
+    t: float            # s since the first row
     stamp_ns: int
-    w_b: Vector
-    f_b: Vector
-    implausible: Vector = ZERO
+    w_b: Vector         # rad/s, turn rate
+    f_b: Vector         # m/s^2, specific force; NO_FORCE: none is published
+    implausible_rate: Vector = ZERO      # rad/s, part of ``w_b`` that no vehicle turns
 
 
-time_of = itemgetter(0)      # definition: sort key of a row
+row_time = itemgetter(0)      # definition: sort key of a row
 Step = tuple[float, float]      # largest change of gyro and of force, in units of their limits
 
 
@@ -76,57 +73,58 @@ class SpikeScreen:
     def __init__(self) -> None:
         self._mean_steps = 0.0, 0.0         # mean ``Step`` from row to row
         self._equal_since = 0.0             # s, start of a run of equal rows
-        self._kept: deque[Row] = deque(maxlen=glitches.NEIGHBOUR_ROWS + 1)
+        self._kept: deque[ImuRow] = deque(maxlen=glitches.NEIGHBOUR_ROWS + 1)
         self._dropped = False               # a row was dropped since the last kept one
         self._step_size = ZERO              # rad/s, implausible step of the gyro, ZERO: none
         self._rate_before = ZERO            # rad/s, rate before the step
         self._implausible_until = 0.0       # s, end of the implausible rates
 
-    def screen(self, rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    def screen(self, rows: Sequence[ImuRow]) -> tuple[list[ImuRow], list[ImuRow]]:
         """Return the rows to keep, with their implausible rates, and the rows to hold."""
         kept, k = [], 0
         while k < len(rows):
-            row, last = rows[k], self._kept[-1] if self._kept else rows[k]
+            row = rows[k]
+            last = self._kept[-1] if self._kept else row
             step, isolated = _step(last, row), self._isolated_axes(rows[k:k + 2])
             spike_rows = None      # number of rows after this one until the values are back
             if any(self._exceeds_usual(step)) and not self._step_is_over(row):
-                within = bisect_right(rows, last.t + glitches.GLITCH_TIME, key=time_of)
-                spike_rows = self._rows_until_return(last, rows[k + 1:within], step)
-                if spike_rows is None and within == len(rows):
+                end = bisect_right(rows, last.t + glitches.GLITCH_TIME, key=row_time)
+                spike_rows = self._rows_until_return(last, rows[k + 1:end], step)
+                if spike_rows is None and end == len(rows):
                     break              # wait for later rows
             if any(isolated) and k + 1 == len(rows) and spike_rows is None:
-                break                  # wait for the next row
+                break                  # wait for the next row, which shows whether it is isolated
             self._update_usual_step(step)
             if any(step) or not any(row.w_b) or not self._kept:      # a gyro may have a dead band
                 self._equal_since = row.t
             self._dropped = spike_rows is not None or row.t - self._equal_since > FROZEN_TIME
             if not self._dropped:
-                implausible = self._implausible_part(last, row, isolated)
-                kept.append(row if implausible is ZERO else row._replace(implausible=implausible))
+                rate = self._implausible_rate(last, row, isolated)
+                kept.append(row if rate is ZERO else row._replace(implausible_rate=rate))
                 self._kept.append(row)
-            k += 1 + (spike_rows or 0)
+            k += 1 if spike_rows is None else 1 + spike_rows
         return kept, list(rows[k:])
 
-    def _isolated_axes(self, rows: Sequence[Row]) -> tuple[bool, ...]:
+    def _isolated_axes(self, rows: Sequence[ImuRow]) -> tuple[bool, ...]:
         """Return a mask of gyro axes with an isolated step; a turn starts over several rows."""
         kept = self._kept
         if self._dropped or len(kept) <= glitches.NEIGHBOUR_ROWS or (
                 _largest(kept[-1].w_b, rows[0].w_b) <= glitches.SINGLE_TURN):
             return ()
-        steps = [[abs(b - a) for a, b in zip(one.w_b, other.w_b, strict=True)]
-                 for one, other in pairwise((*kept, *rows))]
+        steps = [[abs(b - a) for a, b in zip(before.w_b, after.w_b, strict=True)]
+                 for before, after in pairwise((*kept, *rows))]
         current_step = steps.pop(glitches.NEIGHBOUR_ROWS)
-        least = max(glitches.SINGLE_TURN, ISOLATED_CHANGE * (rows[0].t - kept[-1].t))
-        return tuple(size > max(least, glitches.SINGLE_TIMES * max(other_steps))
+        limit = max(glitches.SINGLE_TURN, ISOLATED_CHANGE * (rows[0].t - kept[-1].t))
+        return tuple(size > max(limit, glitches.SINGLE_TIMES * max(other_steps))
                      for size, *other_steps in zip(current_step, *steps, strict=True))
 
-    def _step_is_over(self, row: Row) -> bool:
+    def _step_is_over(self, row: ImuRow) -> bool:
         """Return True if the gyro is back at its value before an implausible step."""
         return self._step_size is not ZERO and (row.t > self._implausible_until or all(
             abs(w - before) <= glitches.RETURN_SHARE * size for w, before, size in zip(
                 row.w_b, self._rate_before, self._step_size, strict=True) if size))
 
-    def _implausible_part(self, last: Row, row: Row, isolated: Sequence[bool]) -> Vector:
+    def _implausible_rate(self, last: ImuRow, row: ImuRow, isolated: Sequence[bool]) -> Vector:
         """Return the implausible part of a rate, rad/s: the size of the step at its start."""
         if self._step_is_over(row):
             self._step_size = ZERO
@@ -149,11 +147,11 @@ class SpikeScreen:
     def _update_usual_step(self, step: Step) -> None:
         """Update the mean step; a single spike has little effect."""
         turn, force = (
-            usual + (min(size, 4 * usual + 1 / glitches.USUAL_STEPS) - usual) / USUAL_ROWS
+            usual + (min(size, 4 * usual + 1 / glitches.USUAL_STEPS) - usual) / MEAN_STEP_ROWS
             for size, usual in zip(step, self._mean_steps, strict=True))
         self._mean_steps = turn, force
 
-    def _rows_until_return(self, last: Row, rows: Sequence[Row], step: Step) -> int | None:
+    def _rows_until_return(self, last: ImuRow, rows: Sequence[ImuRow], step: Step) -> int | None:
         """Return the number of rows until the values are back after a step, None if never."""
         exceeds = self._exceeds_usual(step)
         for k, row in enumerate(rows):
@@ -169,13 +167,13 @@ def _largest(a: Vector, b: Vector) -> float:
     return max(abs(u - x), abs(v - y), abs(w - z))
 
 
-def _step(last: Row, row: Row) -> Step:
+def _step(last: ImuRow, row: ImuRow) -> Step:
     """Return the steps of gyro and force over TURN_STEP and FORCE_STEP; 0 for NO_FORCE."""
     force = _largest(last.f_b, row.f_b) / glitches.FORCE_STEP
-    return _largest(last.w_b, row.w_b) / glitches.TURN_STEP, force if force == force else 0.0
+    return _largest(last.w_b, row.w_b) / glitches.TURN_STEP, 0.0 if math.isnan(force) else force
 
 
-def is_outlier(rows: Sequence[Row]) -> bool:
+def is_outlier(rows: Sequence[ImuRow]) -> bool:
     """
     Return True if the row before the last of OUTLIER_ROWS is an isolated outlier.
 
@@ -188,11 +186,11 @@ def is_outlier(rows: Sequence[Row]) -> bool:
     if not (_largest(before.w_b, row.w_b) > min_share * glitches.SINGLE_TURN
             or _largest(before.f_b, row.f_b) > min_share * glitches.SINGLE_FORCE):
         return False
-    values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
-    for k, (a, b, c, least) in enumerate(zip(*values, OUTLIER_LIMITS, strict=True)):
+    values = [(*imu_row.w_b, *imu_row.f_b) for imu_row in rows]      # six columns
+    for k, (a, b, c, limit) in enumerate(zip(*values[-3:], OUTLIER_LIMITS, strict=True)):
         deviation = abs(b - (a + c) / 2)
-        if deviation > least and abs(c - a) < glitches.EQUAL_NEIGHBOURS * deviation:
-            x = [(*one.w_b, *one.f_b)[k] for one in rows[:-2]]
+        if deviation > limit and abs(c - a) < glitches.EQUAL_NEIGHBOURS * deviation:
+            x = [row_values[k] for row_values in values[:-2]]
             if all(deviation > glitches.SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
                    for i in range(1, len(x) - 1)):
                 return True
@@ -203,8 +201,8 @@ class ImuStream:
     """
     Usable rows of the IMU in order of time.
 
-    path_row : number of the row that the path has reached.   zero_ns : stamp of t = 0.
-    median_interval : s.   notes : list for texts on dropped rows.
+    path_row : number of the row that the path has reached.   zero_ns : stamp of t = 0, 0 before
+    the first row.   median_interval : s.   notes : list to which texts on dropped rows are added.
     """
 
     def __init__(self, config: ApplyConfig, notes: list[str]) -> None:
@@ -214,8 +212,8 @@ class ImuStream:
         self._offset_ns = round(config.imu.time_offset * 1e9)
         self._notes = notes
         self._screen = SpikeScreen()
-        self._held: list[Row] = []      # rows that may be spikes
-        self.rows: list[Row] = []
+        self._held: list[ImuRow] = []      # rows that may be spikes
+        self.rows: list[ImuRow] = []
         self.zero_ns = 0
         self.path_row = 0
         self.median_interval = 0.0
@@ -226,12 +224,12 @@ class ImuStream:
         rows, held_count = self._held, len(self._held)
         for stamp, _, w_i, f_i, *_ in readings:
             w_b, f_b = rotate_vector(self._gyro, w_i), rotate_vector(self._accel, f_i)
-            if not any(f_i) or sum(f_b) != sum(f_b):
+            if not any(f_i) or math.isnan(sum(f_b)):
                 f_b = NO_FORCE
             if is_possible(w_b, f_b):
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
-                rows.append(Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
+                rows.append(ImuRow((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
         self._note_dropped(held_count + len(readings) - len(rows), 'hold NaN or impossible values')
         kept, self._held = self._screen.screen(rows)
         self._note_dropped(len(rows) - len(kept) - len(self._held),
@@ -258,7 +256,7 @@ class ImuStream:
 
     def from_time(self, t: float, low: int = 0) -> int:
         """Return the number of the first row at or after t, s, not before row ``low``."""
-        return bisect_left(self.rows, t, low, key=time_of)
+        return bisect_left(self.rows, t, low, key=row_time)
 
     def drop(self, row: int) -> None:
         """Drop the rows before a row; the current row must not be one of them."""

@@ -1,13 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrated values of a vehicle for dead reckoning; assumed ones are stated."""
+"""Values of a vehicle for dead reckoning: from its calibration, or assumed with a text on it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +19,7 @@ from odocal_ros.settings.node_configs import ApplyConfig
 
 # rad, 1 sigma of angles without a calibration; judgement: 5 and 3 deg of mounting by eye
 UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05
-SIDES = ('scale_factor_left', 'scale_factor_right')
+WHEEL_SCALES = ('scale_factor_left', 'scale_factor_right')
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +29,7 @@ class Vehicle:
     scale: float            # m per unit of the odometer; two wheels: of their mean
     scale_sigma: float      # relative
     wheel_scales: tuple[float, float] | None      # left and right; None: mean only
-    yaw: float              # rad, mounting angles
+    yaw: float              # rad, mounting angles of the IMU, and their sigmas
     pitch: float
     yaw_sigma: float
     pitch_sigma: float
@@ -60,14 +58,9 @@ class Vehicle:
         return np.concatenate([cross_matrix(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
 
     def twist_by_turn(self, rate_b: Vector) -> tuple[float, ...]:
-        """Return ``twist_b`` times a turn rate in b, rad/s, as numbers."""
-        C_vb, lever_arm = self._as_lists
-        rate_v = rotate_vector(C_vb, rate_b)
-        return *cross(lever_arm, rate_v), *rate_v
-
-    @cached_property
-    def _as_lists(self) -> Sequence[Any]:
-        return self.C_vb.tolist(), self.lever_arm.tolist()
+        """Return ``twist_b`` times a turn rate in b, rad/s: (6,) m/s, rad/s, as numbers."""
+        rate_v = rotate_vector(self.C_vb.tolist(), rate_b)
+        return *cross(self.lever_arm.tolist(), rate_v), *rate_v
 
     @cached_property
     def q_bv(self) -> Floats:
@@ -83,27 +76,28 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
             return default, sigma
         return estimate.value, sigma if estimate.sigma is None else estimate.sigma
 
-    if len(config.odometer.wheels) > len(SIDES):
+    if len(config.odometer.wheels) > len(WHEEL_SCALES):
         raise BadConfig(f'odometer.wheels has {len(config.odometer.wheels)} wheels; the limit of '
                         'this node is 2: name the wheels of an axle that does not steer')
     # the odometry uses speeds without corrections, for which another factor is calibrated
     scale, sigma = estimate_of('scale_factor_as_sent', *estimate_of('scale_factor', math.nan))
-    left, right = (estimate_of(name, math.nan)[0] for name in SIDES)
+    left, right = (estimate_of(name, math.nan)[0] for name in WHEEL_SCALES)
     if math.isnan(scale):
         raise BadConfig('the calibration holds no result.scale_factor: start with --params-file '
                         'FILE, where FILE is a calibration.yaml of odocal replay or the '
                         'calibrator')
     nominal = config.imu.nominal_yaw
-    yaw = estimate_of('yaw_mounting_angle', 0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW)
-    pitch = estimate_of('pitch_mounting_angle', 0.0, UNKNOWN_PITCH)
-    assumptions = tuple(f'{name} is not in the calibration: assumed {value:.4g} ± {sigma:.2g} rad'
-                        for name, (value, sigma) in (('yaw_mounting_angle', yaw),
-                                                     ('pitch_mounting_angle', pitch))
+    defaults = {'yaw_mounting_angle': (0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW),
+                'pitch_mounting_angle': (0.0, UNKNOWN_PITCH)}
+    (yaw, yaw_sigma), (pitch, pitch_sigma) = (
+        estimate_of(name, *default) for name, default in defaults.items())
+    assumptions = tuple(f'{name} is not in the calibration: assumed {value:.4g} ± {angle:.2g} rad'
+                        for name, (value, angle) in defaults.items()
                         if name not in estimates or estimates[name].value is None)
     bias = np.array([estimate_of(f'gyro_bias_{axis}', math.nan)[0] for axis in 'xyz'])
     return Vehicle(
         scale, sigma / scale, None if math.isnan(left + right) else (left, right),
-        yaw[0], pitch[0], yaw[1], pitch[1],
+        yaw, pitch, yaw_sigma, pitch_sigma,
         np.array([estimate_of(f'odometer_lever_arm_{axis}', value)[0] for axis, value in zip(
             'xyz', config.odometer.lever_arm, strict=True)]),
         None if np.isnan(bias).any() else bias, assumptions)

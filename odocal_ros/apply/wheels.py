@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Travel of a vehicle by one or two wheels in a stream."""
+"""Travel of a vehicle in a stream: of its only wheel, or the mean of two."""
 
 from collections.abc import Sequence
 import math
@@ -14,19 +14,20 @@ from odocal_ros.settings.node_configs import ApplyConfig
 
 STILL_COUNTS = 1.5    # physical: largest number of counts of a wheel at rest
 SIDES = ('odometer', 'odometer_right')
-Block = tuple[str, Sequence[Reading], OdometerForm]      # slot (name of the input), rows, form
 MAX_WAITING_BLOCKS = 100       # judgement: blocks of rows kept before the first IMU message
 
 
 class Wheels:
-    """Travel of the vehicle, m: of its only wheel, or the mean of two, each with its scale."""
+    """The wheels that are measured, one or two, each with its scale."""
 
     def __init__(self, vehicle: Vehicle, config: ApplyConfig, notes: list[str]) -> None:
         self._vehicle, self._notes = vehicle, notes
-        self._reversed = config.odometer.reversed
+        self._is_reversed = config.odometer.reversed
         self._offset_ns = round(config.odometer.time_offset * 1e9)
         self._has_two_topics = config.odometer.has_two_topics
-        self._waiting: list[Block] = []       # blocks from before the first IMU message
+        # slot and rows of blocks from before the first IMU message
+        self._waiting: list[tuple[str, Sequence[Reading]]] = []
+        self._forms: dict[str, OdometerForm] = {}
         self._wheels: dict[str, Wheel] = {}
         self.quantum = 0.0                   # m, size of a count of the travel
 
@@ -34,57 +35,53 @@ class Wheels:
         """
         Add rows of a wheel, or keep them until the first IMU message.
 
-        slot : name of the input, one of SIDES.   zero_ns : stamp of t = 0; 0: not known yet.
+        slot : one of SIDES.   zero_ns : stamp of t = 0; 0: not known yet.
         """
-        self._waiting.append((slot, rows, form))
+        self._waiting.append((slot, rows))
+        self._forms[slot] = form
         if not zero_ns:
             self._waiting = self._waiting[-MAX_WAITING_BLOCKS:]
             return
-        for block in self._waiting:
-            self._add_rows(*block, zero_ns)
+        offset_ns = self._offset_ns - zero_ns      # from stamps to t
+        for waiting_slot, waiting_rows in self._waiting:
+            wheel = self._wheel(waiting_slot)
+            wheel.feed([(stamp + offset_ns) * 1e-9 for stamp, *_ in waiting_rows],
+                       [value for _, _, value in waiting_rows])
+            self._notes += wheel.notes
+            wheel.notes.clear()
         self._waiting = []
-
-    def _add_rows(self, slot: str, rows: Sequence[Reading], form: OdometerForm,
-                  zero_ns: int) -> None:
-        """Add rows after the first IMU message."""
-        if slot not in self._wheels:
-            self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
-            self._set_scales(form)
-        wheel = self._wheels[slot]
-        since_ns = self._offset_ns - zero_ns
-        wheel.feed([(stamp + since_ns) * 1e-9 for stamp, *_ in rows],
-                   [value for _, _, value in rows])
-        self._notes += wheel.notes
-        wheel.notes.clear()
         wheels = self._wheels.values()
         self.quantum = math.hypot(*(wheel.quantum for wheel in wheels)) / len(wheels)
 
-    def _set_scales(self, form: OdometerForm) -> None:
-        """Set the scales of left and right wheel, if there are two and they are calibrated."""
-        scales = self._vehicle.wheel_scales
-        if len(self._wheels) == 2 and scales is not None and form.sides_known:
-            for slot, scale in zip(SIDES, scales, strict=True):
-                self._wheels[slot].rescale(scale)
+    def _wheel(self, slot: str) -> Wheel:
+        """Return the wheel of a slot; with the second one, both get their calibrated scales."""
+        if slot not in self._wheels:
+            form, scales = self._forms[slot], self._vehicle.wheel_scales
+            self._wheels[slot] = Wheel(form, self._vehicle.scale, self._is_reversed)
+            if len(self._wheels) == 2 and scales is not None and form.sides_known:
+                for side, scale in zip(SIDES, scales, strict=True):
+                    self._wheels[side].rescale(scale)
+        return self._wheels[slot]
 
     def are_complete(self) -> bool:
         """Return True if all expected wheels have rows."""
-        return bool(self._wheels) and all(wheel.t for wheel in self._wheels.values()) and (
+        return bool(self._wheels) and all(wheel.times for wheel in self._wheels.values()) and (
             not self._has_two_topics or len(self._wheels) == 2)
 
     def end_time(self) -> float:
         """Return the time up to which all wheels have rows, s."""
-        return min(wheel.t[-1] for wheel in self._wheels.values())
+        return min(wheel.times[-1] for wheel in self._wheels.values())
 
     def begin_time(self) -> float:
         """Return the time from which all wheels have rows, s."""
-        return max(wheel.t[0] for wheel in self._wheels.values())
+        return max(wheel.times[0] for wheel in self._wheels.values())
 
     def travel_at(self, t: float) -> float:
         """Return the travel at a time, m."""
         return sum(wheel.travel_at(t) for wheel in self._wheels.values()) / len(self._wheels)
 
     def variance_between(self, t_from: float, t_to: float) -> float:
-        """Return the variance of uncertain travel (faults, gaps) between two times, m^2."""
+        """Return the variance of travel that is not measured (faults, gaps), m^2."""
         wheels = self._wheels.values()
         return sum(wheel.variance_between(t_from, t_to) for wheel in wheels) / len(wheels)**2
 
@@ -101,7 +98,7 @@ class Wheels:
     @property
     def delay_sigma_s(self) -> float:
         """Return the sigma of the constant delay of the rows, s."""
-        return max(wheel.delay_sigma_s for wheel in self._wheels.values())
+        return max(wheel.row_times.delay_sigma_s for wheel in self._wheels.values())
 
     def are_still(self, t_from: float, t_to: float) -> bool:
         """Return True if no wheel turned between two times and no counter is stuck."""

@@ -19,7 +19,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from odocal_ros.apply.odometry import Odometry, RESTARTS, stamp_difference_text
-from odocal_ros.apply.pose import Pose, TWIST
+from odocal_ros.apply.pose import Pose, TWIST_OFFSET
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadConfig
@@ -208,7 +208,7 @@ class OdometryNode(CheckedNode):
             self._log_due_ns = now_ns + self._pause_ns
 
     def _publish(self, pose: Pose) -> None:
-        self._twist.send(pose.stamp_ns, pose.raw[TWIST:])
+        self._twist.send(pose.stamp_ns, pose.raw[TWIST_OFFSET:])
         self._pose.send(pose.stamp_ns, pose.raw)
         if self._send_transform is not None:
             self._send_transform(transform_of(pose, self.config.frames))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.apply.stamp_screen import PERMANENT_ROWS, StampScreen, STEP_ROWS
-from odocal_ros.apply.stream import Row, SpikeScreen
+from odocal_ros.apply.stream import ImuRow, SpikeScreen
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm
 
@@ -160,9 +160,9 @@ def test_a_single_step_of_the_gyro_is_implausible_but_a_beginning_turn_is_not():
     turns = np.minimum(np.maximum(t - 1.0, 0.0) * 2.0, 0.2)        # as a vehicle starts to turn
     for add, odd in ((0.2 * (t >= 1.0), 1), (turns, 0)):
         z = w[:, 2] + add
-        rows = [Row(t[k], k, (*w[k, :2], z[k]), (5.0, 5.0, 5.0)) for k in range(len(t))]
+        rows = [ImuRow(t[k], k, (*w[k, :2], z[k]), (5.0, 5.0, 5.0)) for k in range(len(t))]
         for block in (1, 7, 200):
-            found = [row.stamp_ns for row in sifted(rows, block) if any(row.implausible)]
+            found = [row.stamp_ns for row in sifted(rows, block) if any(row.implausible_rate)]
             assert found[:odd] == [100] * odd
             assert bool(found) is bool(odd)
 
@@ -174,12 +174,12 @@ def test_the_screen_keeps_the_same_rows_in_blocks_of_any_size():
         x[at:at + rows, 2] += step
     x[150:180] = x[150]      # constant for longer than STUCK_TIME
     x[180:, 1] += 0.1
-    rows = [Row(k * 0.01, k, tuple(w), tuple(f)) for k, (w, f) in enumerate(
+    rows = [ImuRow(k * 0.01, k, tuple(w), tuple(f)) for k, (w, f) in enumerate(
         zip(x[:, :3].tolist(), x[:, 3:].tolist(), strict=True))]
     first, *others = (sifted(rows, block) for block in (1, 2, 7, n))
     assert [row.stamp_ns for row in first] == [
         k for k in range(n) if k not in (100, 200, 201, 202) and not 160 <= k < 180]
-    assert {row.stamp_ns for row in first if any(row.implausible)} >= {300, 400}
+    assert {row.stamp_ns for row in first if any(row.implausible_rate)} >= {300, 400}
     assert all(kept == first for kept in others)
 
 
@@ -247,5 +247,5 @@ def test_the_variance_covers_a_false_speed_at_rest():
     wheel = Wheel(OdometerForm('rate', 0, '1'), 1.02)
     for row in range(len(t)):
         wheel.feed([float(t[row])], [float(value[row])])
-        assert abs(wheel.s[-1]) <= 3 * np.sqrt(wheel.variance_between(0.0, t[row])) + 0.02
-    assert wheel.s[-1] < -30.0         # false travel, of a vehicle at rest
+        assert abs(wheel.travels[-1]) <= 3 * np.sqrt(wheel.variance_between(0.0, t[row])) + 0.02
+    assert wheel.travels[-1] < -30.0         # false travel, of a vehicle at rest
