@@ -4,11 +4,12 @@
 """
 Layout of serialised messages (CDR): type and offset of each field, without ROS or rosbags.
 
-Messages whose variable parts (strings, lists) have the same lengths have their fields at the
-same offsets: one message determines the layout of all of them, which are then read as columns.
+In: a message and its type. Out: its ``Layout``, which reads fields of many messages as columns.
+Messages whose variable parts (strings, lists) have the same lengths have one layout.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -26,6 +27,7 @@ STRUCT_FORMATS = {'i1': 'b', 'u1': 'B', 'i2': 'h', 'u2': 'H', 'i4': 'i', 'u4': '
                   'u8': 'q', 'f4': 'f', 'f8': 'd'}
 NUMBER_TYPES = ('Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')
 Unpacker = Callable[[bytes], tuple[Any, ...]]      # returns adjacent values of a message
+LITTLE_ENDIAN = b'\x00\x01'       # format: first bytes of a message in XCDR1, little endian
 ELEMENT_PATH = re.compile(r'(.+)\[(\d+)\]')
 
 
@@ -119,11 +121,11 @@ class Layout:
     values: dict[str, Place] = field(default_factory=dict)
     lists: dict[str, Place] = field(default_factory=dict)
     texts: dict[str, list[str]] = field(default_factory=dict)
-    # ranges of the common bytes (encoding, lengths, texts), and their content
-    fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
-    fixed_bytes: list[bytes] = field(default_factory=list)
+    # first byte and end of each range of common bytes (encoding, lengths, texts), and its content
+    common_ranges: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
+    common_bytes: list[bytes] = field(default_factory=list)
     size: int = 4       # bytes of a message
-    _runs: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
+    _parts: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -145,49 +147,49 @@ class Layout:
             return Place(offset, first.dtype)
         return None
 
-    def _runs_of(self, paths: tuple[str, ...]) -> list[AdjacentValues] | None:
-        """Return the values at some paths, adjacent ones together; None if one is missing."""
-        if paths not in self._runs:
-            self._runs[paths] = _adjacent_values([self.find(path) for path in paths])
-        return self._runs[paths]
+    def _adjacent_values(self, paths: tuple[str, ...]) -> list[AdjacentValues] | None:
+        """Return the values at some paths, adjacent ones joined; None if one is missing."""
+        if paths not in self._parts:
+            self._parts[paths] = _join_adjacent([self.find(path) for path in paths])
+        return self._parts[paths]
 
     def columns(self, table: NDArray[np.uint8], paths: Sequence[str]) -> NDArray[Any] | None:
         """Return values of messages, (n, size) bytes: (n, paths); None if a path is missing."""
-        runs = self._runs_of(tuple(paths))
-        if runs is None:
+        parts = self._adjacent_values(tuple(paths))
+        if parts is None:
             return None
-        values = [table[:, run.span].view(run.packed_type).copy().view(run.dtype).reshape(
-            -1, run.width) for run in runs]
-        return values[0] if len(values) == 1 else np.concatenate(values, axis=1)
+        arrays = [table[:, part.span].view(part.packed_type).copy().view(part.dtype).reshape(
+            -1, part.width) for part in parts]
+        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=1)
 
-    def record(self, columns: Sequence[Sequence[str] | None]) -> np.dtype[Any] | None:
+    def record_type(self, columns: Sequence[Sequence[str] | None]) -> np.dtype[Any] | None:
         """Return a structured type with a field for each column; None if one is not adjacent."""
-        runs = [self._runs_of(tuple(paths)) if paths else None for paths in columns]
-        single_runs = [run[0] for run in runs if run is not None and len(run) == 1]
-        return None if len(single_runs) < len(runs) else np.dtype({
-            'names': [str(k) for k in range(len(single_runs))], 'itemsize': self.size,
-            'formats': [(run.dtype, (run.width,)) for run in single_runs],
-            'offsets': [run.span.start for run in single_runs]})
-
-    def unpackers(self, columns: Sequence[Sequence[str] | None]) -> list[Unpacker]:
-        """Return a function for each field of ``record`` that returns its values; [] for None."""
-        record = self.record(columns)
-        fields = (record.fields or {}).values() if record is not None else ()
-        # such as '<3d' for three doubles
-        return [partial(struct.Struct(
-            f'<{dtype.shape[0]}{STRUCT_FORMATS[dtype.base.str[1:]]}').unpack_from,
-            offset=offset) for dtype, offset, *_ in fields]
+        parts = [self._adjacent_values(tuple(paths)) if paths else None for paths in columns]
+        fields = [part[0] for part in parts if part is not None and len(part) == 1]
+        return None if len(fields) < len(parts) else np.dtype({
+            'names': [str(k) for k in range(len(fields))], 'itemsize': self.size,
+            'formats': [(values.dtype, (values.width,)) for values in fields],
+            'offsets': [values.span.start for values in fields]})
 
     def fits(self, raw: bytes) -> bool:
         """Return True if a message has this layout."""
-        return self.size <= len(raw) and all(raw[a:b] == expected for (a, b), expected in zip(
-            self.fixed, self.fixed_bytes, strict=True))
+        return self.size <= len(raw) and all(
+            raw[start:stop] == expected for (start, stop), expected in zip(
+                self.common_ranges, self.common_bytes, strict=True))
 
 
 _latest_layouts: dict[str, Layout] = {}      # by message type: most topics have only one
 
 
-def _adjacent_values(places: Sequence[Place | None]) -> list[AdjacentValues] | None:
+def unpackers_of(record_type: np.dtype[Any]) -> list[Unpacker]:
+    """Return a function for each field of a ``record_type`` that returns its values."""
+    # such as '<3d' for three doubles
+    return [partial(struct.Struct(
+        f'<{dtype.shape[0]}{STRUCT_FORMATS[dtype.base.str[1:]]}').unpack_from,
+        offset=offset) for dtype, offset, *_ in (record_type.fields or {}).values()]
+
+
+def _join_adjacent(places: Sequence[Place | None]) -> list[AdjacentValues] | None:
     """Return values at some places, adjacent ones of a type joined; None if one is missing."""
     joined: list[tuple[slice, str, int]] = []      # bytes, type and number of values
     for place in places:
@@ -205,18 +207,16 @@ def _adjacent_values(places: Sequence[Place | None]) -> list[AdjacentValues] | N
 
 def layout_of(msgtype: str, raw: bytes) -> Layout | None:
     """Return the layout of one message, which may be longer; None if it has none."""
-    if msgtype not in SCHEMAS or raw[:2] != b'\x00\x01':    # XCDR1, little endian
+    if msgtype not in SCHEMAS or raw[:2] != LITTLE_ENDIAN:
         return None
     latest = _latest_layouts.get(msgtype)
     if latest and latest.fits(raw):
         return latest
-    scan = _LayoutScan(raw)
-    layout = scan.layout
-    try:
-        scan.scan_fields(SCHEMAS[msgtype], '')
-    except (struct.error, ValueError):
+    scan = _LayoutScan(raw, SCHEMAS[msgtype])
+    if scan.path:
         return None
-    layout.fixed_bytes = [raw[a:b] for a, b in layout.fixed]
+    layout = scan.layout
+    layout.common_bytes = [raw[start:stop] for start, stop in layout.common_ranges]
     _latest_layouts[msgtype] = layout
     return layout
 
@@ -231,32 +231,34 @@ def frame_of(msgtype: str, raw: bytes) -> str | None:
 
 def damaged_field(msgtype: str, raw: bytes) -> str:
     """Return the field in which a message ends or has an impossible length; '' if unknown."""
-    scan = _LayoutScan(raw)
-    try:
-        scan.scan_fields(SCHEMAS.get(msgtype, ()) if raw[:2] == b'\x00\x01' else (), '')
-    except (struct.error, ValueError):
-        return scan.path
-    return ''
+    return _LayoutScan(raw, SCHEMAS.get(msgtype, ())).path if raw[:2] == LITTLE_ENDIAN else ''
 
 
 class _LayoutScan:
-    """Sequential scan of one message that stores the offsets of all fields."""
+    """
+    Sequential scan of one message that stores the offsets of all fields.
 
-    def __init__(self, raw: bytes) -> None:
+    path : of the field in which the message ends or has an impossible length; '' without one.
+    """
+
+    def __init__(self, raw: bytes, schema: Sequence[str]) -> None:
         self.raw, self.path, self.layout = raw, '', Layout()
+        with suppress(struct.error, ValueError):
+            self.scan_fields(schema)
+            self.path = ''
 
-    def scan_fields(self, schema: Sequence[str], prefix: str) -> None:
+    def scan_fields(self, schema: Sequence[str], prefix: str = '') -> None:
         for line in schema:
             kind, path = line.split()
             self.path = prefix + path
-            base, _, size = kind.partition('[')
-            count = 1 if not size else self.read_length() if size == ']' else int(size[:-1])
-            self.scan_value(base, prefix + path, count, is_list=bool(size))
+            base, _, size = kind.partition('[')      # size: '' of one value, ']' of a list, 'n]'
+            count = self.read_length() if size == ']' else int(size[:-1] or 1)
+            self.scan_values(base, self.path, count, is_list=bool(size))
 
-    def scan_value(self, kind: str, path: str, count: int, is_list: bool = False) -> None:
+    def scan_values(self, kind: str, path: str, count: int, is_list: bool) -> None:
         layout = self.layout
         if kind == 'string':
-            texts = [self.scan_text(is_list) for _ in range(count)]
+            texts = [self.scan_text(is_stored=is_list) for _ in range(count)]
             if is_list:
                 layout.texts[path] = texts
         elif kind == 'dim':
@@ -287,14 +289,14 @@ class _LayoutScan:
         length: int = struct.unpack_from('<I', self.raw, offset)[0]
         if length > len(self.raw):
             raise ValueError(self.path)
-        self.layout.fixed.append((offset, offset + 4))
+        self.layout.common_ranges.append((offset, offset + 4))
         return length
 
-    def scan_text(self, keep: bool) -> str:
-        """Skip a string; return it if ``keep``: the layout includes its content."""
+    def scan_text(self, is_stored: bool) -> str:
+        """Skip a string; return it if the layout includes its content, else ''."""
         length = self.read_length()
         begin = self.advance(length)
-        if not keep:
+        if not is_stored:
             return ''
-        self.layout.fixed.append((begin, begin + length))
+        self.layout.common_ranges.append((begin, begin + length))
         return self.raw[begin:begin + max(length - 1, 0)].decode()

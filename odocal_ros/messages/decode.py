@@ -62,11 +62,11 @@ class Reader:
         self.unreadable = 0
         self.error = ''
         self.frames: FrameFilter | None = None      # of an IMU
-        self.by_arrival = False      # the stamps of the messages are not used
+        self.uses_arrival = False      # as stamps, in place of those of the messages
         self._plan = plan
         # of the last block that ``_read_small_block`` has read
         self._layout: cdr.Layout | None = None
-        self._record: np.dtype[Any] | None = None      # structured type of its messages
+        self._record_type: np.dtype[Any] | None = None      # of its messages
         self._unpackers: list[cdr.Unpacker] = []       # functions that read its plain numbers
 
     @property
@@ -89,20 +89,22 @@ class Reader:
         """
         Decode messages.
 
-        raws : serialised messages (CDR), in order of arrival.   received_ns : their arrival; the
-        stamp of messages without one.   deserialize : converts one to an object, if needed.
+        raws : serialised messages (CDR), in order of arrival.   received_ns : their arrival times,
+        also used as stamps of messages without one.   deserialize : converts one to an object.
 
         Returns (slot, block) pairs, one for each wheel of a message, none without a row. Raises
         BadData: the message type cannot have the value: no such field, not a number.
         """
-        other_imu, raws = None, raws if len(raws) <= SMALL_BLOCK else RawMessages.joined(raws)
+        other_imu = None
+        if len(raws) > SMALL_BLOCK:
+            raws = RawMessages.joined(raws)
         if self.frames is not None and len(raws):
             keep, other_imu = self.frames.separate(raws, received_ns, deserialize)
             if other_imu is not None:
                 raws = RawMessages.joined(raws).take(keep)
                 received_ns = np.asarray(received_ns, np.int64)[keep]
         pairs = self._rows(raws, received_ns, deserialize)
-        if self.by_arrival:
+        if self.uses_arrival:
             pairs = [(slot, replace(block, stamp_ns=block.received_ns)) for slot, block in pairs]
         return pairs if other_imu is None else [*pairs, ('imu_other', other_imu)]
 
@@ -113,9 +115,9 @@ class Reader:
 
         A reading has stamp and arrival, ns, then the first columns of the samples.
         """
-        layout_fits = self._layout.fits if self._layout and self._unpackers else None
-        if layout_fits and not self.by_arrival and all(map(layout_fits, raws)) and (
-                self.frames is None or all(map(self.frames.is_used, raws))):
+        if (self._layout and self._unpackers and not self.uses_arrival
+                and all(map(self._layout.fits, raws))
+                and (self.frames is None or all(map(self.frames.is_used, raws)))):
             return self._plan.readings(received_ns, [
                 [unpack(raw) for unpack in self._unpackers] for raw in raws])
         return [(slot, readings_of(block))
@@ -131,31 +133,26 @@ class Reader:
             return []
         if columns := self._read_small_block(raws):
             return plan.build(np.array(received_ns, np.int64), columns)
-        arrays: list[NDArray[Any]] = []
+        columns = [np.empty((len(raws), column.width), column.dtype) for column in plan.columns]
         has_row = np.ones(len(raws), bool)
         for layout, rows, table in tables(self.msgtype, raws):
-            values = self._columns_of(layout, table) if layout else None
-            if values and isinstance(rows, slice):       # all of them: no copy
-                arrays = values
-                break
-            arrays = arrays or [np.empty((len(raws), column.width), column.dtype)
-                                for column in plan.columns]
             if layout is None:
                 for i in np.arange(len(raws))[rows].tolist():
-                    if not (row := self._read_row(raws[i], deserialize)):
-                        has_row[i] = False
-                        continue
-                    for target, value in zip(arrays, row, strict=True):
-                        target[i] = value
-            elif values is None:
+                    row = self._read_row(raws[i], deserialize)
+                    has_row[i] = bool(row)
+                    for column, value in zip(columns, row, strict=False):      # or []
+                        column[i] = value
+            elif not (values := self._columns_of(layout, table)):
                 has_row[rows] = False
+            elif isinstance(rows, slice):       # all messages: no copy
+                columns = values
             else:
-                for target, value in zip(arrays, values, strict=True):
-                    target[rows] = value
+                for column, value in zip(columns, values, strict=True):
+                    column[rows] = value
         received = np.array(received_ns, np.int64)
         if not has_row.all():
-            arrays, received = [values[has_row] for values in arrays], received[has_row]
-        return plan.build(received, arrays) if len(received) else []
+            columns, received = [column[has_row] for column in columns], received[has_row]
+        return plan.build(received, columns) if len(received) else []
 
     def _read_small_block(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
         """Return the columns of a few messages of one layout; [] if they have several or none."""
@@ -166,23 +163,24 @@ class Reader:
         if layout is not self._layout:
             self._layout = layout
             paths = [column.find_paths(layout) for column in columns]
-            self._record, self._unpackers = layout.record(paths), (
-                layout.unpackers(paths) if self._plan.has_readings else [])
-        if self._record is None:
+            self._record_type = record_type = layout.record_type(paths)
+            self._unpackers = [] if record_type is None or not self._plan.has_readings else (
+                cdr.unpackers_of(record_type))
+        if self._record_type is None:
             return []
-        table = np.frombuffer(b''.join([raw[:layout.size] for raw in raws]), self._record)
+        table = np.frombuffer(b''.join([raw[:layout.size] for raw in raws]), self._record_type)
         return [table[name].astype(column.dtype) for name, column in zip(
-            self._record.names or (), columns, strict=True)]
+            self._record_type.names or (), columns, strict=True)]
 
-    def _columns_of(self, layout: cdr.Layout, table: Table) -> list[NDArray[Any]] | None:
-        """Return the columns of messages of one layout; None if one is missing."""
+    def _columns_of(self, layout: cdr.Layout, table: Table) -> list[NDArray[Any]]:
+        """Return the columns of messages of one layout; [] if one is missing."""
         values: list[NDArray[Any]] = []
         for column in self._plan.columns:
             paths = column.find_paths(layout)
             value = layout.columns(table, paths) if paths else None
             if value is None:
                 self._count_unreadable(len(table), self._plan.missing_reason(layout))
-                return None
+                return []
             values.append(np.asarray(value, column.dtype))
         return values
 
@@ -222,10 +220,10 @@ class Reader:
             self.unreadable += 1
             return []
         try:
-            values = [column.of_message(view) for column in self._plan.columns]
+            values = [column.values_of(view) for column in self._plan.columns]
         except (AttributeError, LookupError, TypeError, ValueError):
-            values = [None]
-        if any(value is None for value in values):
+            values = [[]]
+        if not all(values):
             self._count_unreadable(1, self._plan.missing_reason(view))
             return []
         return values
@@ -244,7 +242,7 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
     reader = Reader(slot, msgtype, OdometerPlan(slot, msgtype, config) if slot in WHEELS
                     else sensor_plan(slot, msgtype, config))
     if clock := INPUTS[slot].clock:
-        reader.by_arrival = getattr(config, clock).arrival_time
+        reader.uses_arrival = getattr(config, clock).arrival_time
     if slot == 'imu':
         reader.frames = FrameFilter(msgtype, config.imu.frame_id)
     return reader

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Fields of messages by path, and how the messages of each sensor but the odometer become samples.
+Fields of messages by path, and the conversion of messages to samples, except of the odometer.
 
 A message is read as bytes (``cdr.Layout``) or as an object (``MessageView``). A path is dotted,
 with [i] or [name] for an element of a list: ``pose.covariance[0]``, ``position[left_wheel]``.
@@ -48,25 +48,23 @@ class MessageView:
             return 0
 
     def value(self, path: str) -> Any:
-        """Return the value at a path, [name] by the list ``name``; AttributeError, LookupError."""
+        """
+        Return the value at a path.
+
+        [name] is the index of a name in the list ``name`` beside the list; or LookupError,
+        AttributeError, TypeError.
+        """
         value: Any = self.message
-        owner = value      # of the list that ``value`` is
+        owner = value      # message that contains ``value``
         for name, key in path_parts(path):
             if name:
                 value, owner = getattr(value, name), value
-            else:
-                value = value[self._index(owner, key)]
+                continue
+            names = list(getattr(owner, 'name', ()))
+            if key not in names and not key.isdigit():
+                raise LookupError(f'no {key!r} among {", ".join(map(str, names)) or "no names"}')
+            value = value[names.index(key) if key in names else int(key)]
         return value
-
-    @staticmethod
-    def _index(owner: object, key: str) -> int:
-        """Return the index in a list of ``owner``: by its list ``name``, or a number as text."""
-        names = list(getattr(owner, 'name', ()))
-        if key in names:
-            return names.index(key)
-        if key.isdigit():
-            return int(key)
-        raise LookupError(f'no {key!r} among {", ".join(map(str, names)) or "no names"}')
 
     def fields(self) -> list[str]:
         """Return the names of the message's fields, for error messages."""
@@ -81,7 +79,7 @@ View = Layout | MessageView
 
 @lru_cache
 def path_parts(path: str) -> tuple[tuple[str, str], ...]:
-    """Return a path as (name, '') and ('', key) pairs; empty if it is not a path."""
+    """Return a path as (name, '') and ('', key) pairs; () if it is not a path."""
     pairs = tuple(PATH_PART.findall(path))
     rebuilt = ''.join(f'[{key}]' if key else f'.{name}' for name, key in pairs)
     return pairs if rebuilt.lstrip('.') == path else ()
@@ -95,12 +93,12 @@ class Column:
     width: int      # number of values
     find_paths: Callable[[View], Sequence[str] | None]      # in a message; None: they are missing
 
-    def of_message(self, view: MessageView) -> list[Any] | None:
-        """Return the values of an object; None if they are missing."""
+    def values_of(self, view: MessageView) -> list[Any]:
+        """Return the values of an object; [] if they are missing."""
         values = [view.value(path) for path in self.find_paths(view) or ()]
         if self.dtype is np.int64:
             values = [(int(v) + 2**63) % 2**64 - 2**63 for v in values]   # uint64 as int64 bits
-        return values or None
+        return values
 
 
 def fixed_column(dtype: type, *paths: str) -> Column:
@@ -131,9 +129,11 @@ GPS_FIXES = ('gps_msgs/msg/GPSFix', 'gps_common/msg/GPSFix')    # of ROS 2 and R
 GEODETIC = (FIX, *GPS_FIXES)
 # format: status of a GPSFix with satellite corrections; others above 2: base station, as 2
 WAAS_FIX = 33
+MAX_VARIANCE = 1e12    # (m/s)^2; judgement: for unknown, drivers send 0 or more
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, samples.Samples]]      # slot and samples
-Build = Callable[..., samples.Samples]  # function of stamps, arrivals and the columns of a sensor
+# function of stamps and arrivals, (n,) ns, and the columns of a sensor, (n, width) each
+Build = Callable[..., samples.Samples]
 # format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
 NOT_SENT_BITS = np.float64(-1).view(np.int64)
 # format: block of the position in a 6 x 6 covariance, row by row
@@ -175,17 +175,18 @@ class SensorPlan:
                 received_ns, values, strict=True)])]
 
 
-def _imu(stamps: Ints, received: Ints, q_ni: Floats, roll_variance: Floats, yaw_variance: Floats,
-         w_i: Floats, f_i: Floats, force_variance: Floats) -> samples.ImuSamples:
+def _build_imu(stamps: Ints, received: Ints, q_ni: Floats, roll_variance: Floats,
+               yaw_variance: Floats, w_i: Floats, f_i: Floats,
+               force_variance: Floats) -> samples.ImuSamples:
     has_no_force = force_variance.view(np.int64)[:, 0] == NOT_SENT_BITS
     if has_no_force.any():
         f_i[has_no_force] = np.nan
     return samples.from_columns(samples.ImuSamples, stamps, received, w_i, f_i, q_ni,
-                              _yaw_variance(q_ni, roll_variance, yaw_variance))
+                                _yaw_variance(q_ni, roll_variance, yaw_variance))
 
 
-def _heading(stamps: Ints, received: Ints, q_ni: Floats,
-             *variances: Floats) -> samples.HeadingSamples:
+def _build_headings(stamps: Ints, received: Ints, q_ni: Floats,
+                    *variances: Floats) -> samples.HeadingSamples:
     return samples.HeadingSamples(stamps, received, q_ni, _yaw_variance(q_ni, *variances))
 
 
@@ -196,26 +197,26 @@ def _yaw_variance(q_ni: Floats, roll_variance: Floats, yaw_variance: Floats) -> 
     return np.where(has_orientation, yaw_variance[:, 0], np.nan)
 
 
-def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats,
-         covariance_type: Ints, status: Ints) -> samples.FixSamples:
+def _build_fixes(stamps: Ints, received: Ints, position: Floats, covariance: Floats,
+                 covariance_type: Ints, status: Ints) -> samples.FixSamples:
     with np.errstate(invalid='ignore'):      # a signalling NaN
         latitude, longitude = position[:, 0] * RAD_PER_DEG, position[:, 1] * RAD_PER_DEG
     return samples.from_columns(samples.FixSamples, stamps, received, latitude, longitude,
-                              position[:, 2].copy(),
-                              covariance.reshape(-1, 3, 3), covariance_type[:, 0], status[:, 0])
+                                position[:, 2].copy(), covariance.reshape(-1, 3, 3),
+                                covariance_type[:, 0], status[:, 0])
 
 
-def _gps_fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats,
-             covariance_type: Ints, status: Ints) -> samples.FixSamples:
+def _build_gps_fixes(stamps: Ints, received: Ints, position: Floats, covariance: Floats,
+                     covariance_type: Ints, status: Ints) -> samples.FixSamples:
     """Return fixes with the status of a NavSatFix."""
-    return _fix(stamps, received, position, covariance, covariance_type,
-                np.where(status == WAAS_FIX, 1, np.clip(status, -1, 2)))
+    return _build_fixes(stamps, received, position, covariance, covariance_type,
+                        np.where(status == WAAS_FIX, 1, np.clip(status, -1, 2)))
 
 
-def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
-              *covariance: Floats) -> samples.VelocitySamples:
-    variance = covariance[0] if covariance else np.zeros_like(velocity_n)
-    is_known = (variance > 0) & (variance < 1e12)    # drivers send 0 or huge values for unknown
+def _build_velocities(stamps: Ints, received: Ints, velocity_n: Floats,
+                      *variances: Floats) -> samples.VelocitySamples:
+    variance = variances[0] if variances else np.zeros_like(velocity_n)
+    is_known = (variance > 0) & (variance < MAX_VARIANCE)
     return samples.VelocitySamples(stamps, received, velocity_n, np.where(is_known, variance, 0.0))
 
 
@@ -230,15 +231,15 @@ _ORIENTATION = (vector_column('orientation', 'xyzw'), array_column('orientation_
 SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
     ('imu', IMU): ((*_ORIENTATION, vector_column('angular_velocity'),
                     vector_column('linear_acceleration'),
-                    array_column('linear_acceleration_covariance', 0)), _imu),
-    ('heading', IMU): (_ORIENTATION, _heading),
-    ('fix', FIX): (_GEODETIC, _fix),
-    **{('fix', kind): (_GEODETIC, _gps_fix) for kind in GPS_FIXES},
-    ('fix_velocity', 'geometry_msgs/msg/TwistStamped'): ((vector_column('twist.linear'),),
-                                                         _velocity),
+                    array_column('linear_acceleration_covariance', 0)), _build_imu),
+    ('heading', IMU): (_ORIENTATION, _build_headings),
+    ('fix', FIX): (_GEODETIC, _build_fixes),
+    **{('fix', kind): (_GEODETIC, _build_gps_fixes) for kind in GPS_FIXES},
+    ('fix_velocity', 'geometry_msgs/msg/TwistStamped'): (
+        (vector_column('twist.linear'),), _build_velocities),
     ('fix_velocity', 'geometry_msgs/msg/TwistWithCovarianceStamped'): (
         (vector_column('twist.twist.linear'), array_column('twist.covariance', 0, 7, 14)),
-        _velocity),
+        _build_velocities),
     ('pressure', 'sensor_msgs/msg/FluidPressure'): (
         (fixed_column(np.float64, 'fluid_pressure', 'variance'),),
         lambda stamps, received, sent: samples.ScalarSamples(stamps, received, *sent.T)),

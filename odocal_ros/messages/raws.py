@@ -64,7 +64,7 @@ class RawMessages(Sequence[bytes]):
         return RawMessages(self.data, self.start[rows], self.size[rows])
 
     def table(self, rows: Ints) -> Table:
-        """Return a copy of messages of equal length: (n, size) bytes."""
+        """Return a copy of the messages of some rows, of equal length: (n, size) bytes."""
         start = self.start if len(rows) == len(self) else self.start[rows]
         size = int(self.size[rows[0]]) if len(rows) else 0
         if not size:
@@ -89,6 +89,7 @@ class RawMessages(Sequence[bytes]):
         if (self.size == self.size[0]).all():
             return [np.arange(len(self))]
         order = np.argsort(self.size, kind='stable')
+        # split where the sorted length changes
         return np.split(order, np.flatnonzero(np.diff(self.size[order])) + 1)
 
 
@@ -104,7 +105,8 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[cdr.Layout | N
         table = raws.table(rows)
         for _ in range(MAX_LAYOUTS):
             layout = cdr.layout_of(msgtype, table[0].tobytes())
-            matches = _same_layout(table, layout.fixed if layout else [(0, table.shape[1])])
+            ranges = layout.common_ranges if layout else [(0, table.shape[1])]
+            matches = _same_layout(table, ranges)
             all_match = bool(matches.all())
             if layout is None:
                 without_layout.append(rows[matches])
@@ -121,12 +123,12 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[cdr.Layout | N
         yield None, np.sort(np.concatenate(without_layout)), np.empty((0, 0), np.uint8)
 
 
-def _same_layout(table: Table, fixed: Sequence[tuple[int, int]]) -> Bools:
+def _same_layout(table: Table, common_ranges: Sequence[tuple[int, int]]) -> Bools:
     """Return a mask of messages of one length whose layout bytes equal those of the first."""
     matches = np.ones(len(table), bool)
-    for start, stop in fixed:
+    for start, stop in common_ranges:
         part = table[:, start:stop]
-        if stop - start in (2, 4, 8):
+        if stop - start in (2, 4, 8):      # faster as one number
             number = part.view(f'u{stop - start}')[:, 0]
             matches &= number == number[0]
         else:
@@ -158,7 +160,7 @@ class FrameFilter:
         while not self._is_determined and first < len(raws):
             self._count_frame(self._frame(raws[first], deserialize))
             first += 1
-        keep[first:] = self._with_frame(raws[first:])
+        keep[first:] = self._have_frame(raws[first:])
         if keep.all():
             return keep, None
         other_frames, stamps = [], []
@@ -196,14 +198,14 @@ class FrameFilter:
     def _frame_prefix(self) -> bytes:
         """Return the first bytes of a message (CDR, little endian), and its frame_id."""
         text = self.frame.encode() + b'\0'
-        return b'\0\1' + struct.pack('<I', len(text)) + text
+        return cdr.LITTLE_ENDIAN + struct.pack('<I', len(text)) + text
 
-    def _with_frame(self, raws: Sequence[bytes]) -> Bools:
+    def _have_frame(self, raws: Sequence[bytes]) -> Bools:
         """Return a mask of messages with the frame at its place in CDR, little endian."""
         if len(raws) <= SMALL_BLOCK:
             return np.array([self._has_frame(raw) for raw in raws], bool)
         joined = RawMessages.joined(raws)
-        # bytes of the encoding, then length and text of the frame_id
+        # compared bytes of each message: of the encoding, then length and text of the frame_id
         offsets = np.concatenate([[0, 1], TEXT_OFFSET + np.arange(len(self._prefix) - 2)])
         data = np.frombuffer(joined.data, np.uint8)
         expected = np.frombuffer(self._prefix, np.uint8)
@@ -222,7 +224,7 @@ class FrameFilter:
 
 def _stamp_ns(raw: bytes) -> int:
     """Return the header stamp of a message in little-endian CDR, ns; 0 (no stamp) for others."""
-    if raw[:2] != b'\0\1':
+    if raw[:2] != cdr.LITTLE_ENDIAN:
         return 0
     second, nanosecond = struct.unpack_from('<iI', raw, 4)
     return int(second) * 10**9 + int(nanosecond)

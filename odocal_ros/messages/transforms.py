@@ -10,11 +10,12 @@ as fixes, each once all transforms between the two are known.
 
 from collections.abc import Callable, Container, Mapping, Sequence
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from odocal_ros.data.arrays import Ints
+from odocal_ros.messages.cdr import LITTLE_ENDIAN
 from odocal_ros.messages.decode import Deserialize, Reader
 from odocal_ros.messages.message_fields import Pairs, SensorPlan, TRANSFORMS
 from odocal_ros.nav.frame_chain import FrameChain
@@ -23,31 +24,41 @@ from odocal_ros.settings.config import Config
 
 STATIC = '_static'      # suffix of the topic of static transforms
 MAX_NAMES, MAX_LETTERS = 12, 40     # judgement: in a text: frames, and characters of each
-Transform = tuple[str, str, int, tuple[float, ...]]     # child, parent, stamp ns, values
+
+
+class Transform(NamedTuple):
+    """Pose of a child frame in its parent: x y z, m, quaternion x y z w."""
+
+    child: str
+    parent: str
+    stamp_ns: int
+    values: tuple[float, ...]
 
 
 def transforms_of(raw: bytes, deserialize: Callable[[bytes], Any]) -> list[Transform]:
-    """Return the transforms of a TFMessage: x y z, m, quaternion x y z w; may raise any error."""
-    if raw[:2] != b'\0\1':      # XCDR1, little endian
-        return [(_name(message.child_frame_id), _name(message.header.frame_id),
-                 message.header.stamp.sec * 10**9 + message.header.stamp.nanosec,
-                 tuple(float(getattr(part, axis)) for part, axes in (
-                     (message.transform.translation, 'xyz'),
-                     (message.transform.rotation, 'xyzw')) for axis in axes))
-                for message in deserialize(raw).transforms]
+    """Return the transforms of a TFMessage; may raise any error."""
+    if raw[:2] != LITTLE_ENDIAN:
+        return [_transform_of(message) for message in deserialize(raw).transforms]
+    # in CDR: 4 bytes of encoding, number of transforms, then stamp, two frames and 7 doubles each
     transforms, offset = [], 8
     for _ in range(struct.unpack_from('<I', raw, 4)[0]):
         second, nanosecond = struct.unpack_from('<iI', raw, offset)
-        parent, offset = _text(raw, offset + 8)
-        child, offset = _text(raw, offset)
-        offset += (4 - offset) % 8      # counted from after the four bytes
-        transforms.append((child, parent, second * 10**9 + nanosecond,
-                           struct.unpack_from('<7d', raw, offset)))
+        parent, offset = _read_frame(raw, offset + 8)
+        child, offset = _read_frame(raw, offset)
+        offset += (4 - offset) % 8      # doubles are aligned relative to byte 4
+        transforms.append(Transform(child, parent, second * 10**9 + nanosecond,
+                                    struct.unpack_from('<7d', raw, offset)))
         offset += 7 * 8
     return transforms
 
 
-def _text(raw: bytes, offset: int) -> tuple[str, int]:
+def _transform_of(message: Any) -> Transform:
+    stamp, arm, q = message.header.stamp, message.transform.translation, message.transform.rotation
+    return Transform(_name(message.child_frame_id), _name(message.header.frame_id),
+                     stamp.sec * 10**9 + stamp.nanosec, (arm.x, arm.y, arm.z, q.x, q.y, q.z, q.w))
+
+
+def _read_frame(raw: bytes, offset: int) -> tuple[str, int]:
     """Return the frame at an offset, and the offset after it."""
     offset += -offset % 4
     end = offset + 4 + int(struct.unpack_from('<I', raw, offset)[0])
@@ -89,7 +100,7 @@ class TransformReader(Reader):
     def new_positions(self) -> Pairs:
         """Return the positions that can be computed now."""
         stamps, received, position = self._chain.pop_positions()
-        self._has_position = self._has_position or len(stamps) > 0
+        self._has_position |= len(stamps) > 0
         self.unreadable = self._damaged if self._has_position else self._messages
         self.error = 'damaged messages' if self._has_position else self._missing_reason()
         return [('fix', self._build(stamps, received, position))] if len(stamps) else []

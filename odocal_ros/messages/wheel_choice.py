@@ -26,11 +26,13 @@ EXCLUDED_WHOLE_WORDS = (
     'boom', 'bucket', 'door', 'throttle', 'pedal', 'flipper', 'lidar', 'laser', 'hinge', 'slider',
     'yaw', 'pitch', 'roll')
 REAR, FRONT = ('rear', 'back', 'aft'), ('front', 'fore')
-LETTERS = {'f': 'front', 'r': 'rear', 'b': 'rear', 'm': 'middle', 'c': 'middle'}
+AXLE_LETTERS = {'f': 'front', 'r': 'rear', 'b': 'rear', 'm': 'middle', 'c': 'middle'}
+
+MAX_SHOWN_KEYS = 12      # judgement: in a text
 
 
 @dataclass(frozen=True)
-class Choice:
+class WheelChoice:
     """The selected values (joint names or indices), left before right if ``sides_known``."""
 
     keys: tuple[str, ...]
@@ -38,7 +40,7 @@ class Choice:
     explanation: str      # text for the user; '' if there was no choice
 
 
-def select_wheels(names: Sequence[str], count: int) -> Choice | str:
+def select_wheels(names: Sequence[str], count: int) -> WheelChoice | str:
     """Return the wheels among ``count`` values, or why they are unclear; names : [] if none."""
     names = list(names[:count])
     keys = names or [str(k) for k in range(count)]
@@ -51,25 +53,25 @@ def select_wheels(names: Sequence[str], count: int) -> Choice | str:
         if not selected:
             return (f'its only joint, {keys[0]}, does not have a wheel name; select it with '
                     'odometer.field')
-        return Choice((keys[0],), True, '')
-    if isinstance(selected, Choice):
+        return WheelChoice((keys[0],), True, '')
+    if isinstance(selected, WheelChoice):
         return selected
     if len(selected) == 1:
-        return Choice((selected[0],), True,
-                      f'joints {_list_text(keys)}: only {selected[0]} is used, selected by name')
+        return WheelChoice(selected, True, (
+            f'joints {_list_text(keys)}: only {selected[0]} is used, selected by name'))
     if len(selected) == 2:
         noun = 'joints' if names else 'values'
         first, second = selected
-        return Choice((first, second), False, f'{noun} {_list_text(keys)}: the mean of {first} '
-                      f'and {second} is used. Left and right cannot be decided from the data; '
-                      'below, the first is called left')
+        return WheelChoice(selected, False, (
+            f'{noun} {_list_text(keys)}: the mean of {first} and {second} is used. Left and right '
+            'cannot be decided from the data; below, the first is called left'))
     noun = f'the joints {_list_text(keys)}' if names else f'a list of {count} values'
     return (f'the wheels among {noun} are not clear: set odometer.wheels'
             f'{"" if names else " (indices from 0)"}, or odometer.field for one; '
             'odocal inspect shows how each value moves')
 
 
-def key_on_side(choice: Choice, side: str) -> str:
+def key_on_side(choice: WheelChoice, side: str) -> str:
     """Return the key of the wheel on one side, 'left' or 'right'; '' if sides are unknown."""
     if len(choice.keys) == 1:
         return choice.keys[0]
@@ -77,7 +79,7 @@ def key_on_side(choice: Choice, side: str) -> str:
     return (left if side == 'left' else right) if choice.sides_known else ''
 
 
-def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
+def _select_by_name(names: Sequence[str]) -> WheelChoice | tuple[str, ...]:
     """Return the pair selected by name, otherwise all possible wheels."""
     not_excluded = [name for name in names if not _contains(name, EXCLUDED_WORDS)]
     candidates = [name for name in not_excluded if _contains(name, WHEEL_WORDS_IN_NAME)]
@@ -86,30 +88,30 @@ def _select_by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
                         if not set(_words(name)) & set(EXCLUDED_WHOLE_WORDS)]
         candidates = [name for name in not_excluded
                       if _contains(name, DRIVE_WORDS_IN_NAME)] or not_excluded
-    sides = {name: _side_and_rest(name)[0] for name in candidates}
-    rests = {name: _side_and_rest(name)[1] for name in candidates}      # equal in a pair
-    left, right = ([name for name in candidates if sides[name] == side]
+    # name -> side and rest, which is equal in a pair
+    parts = {name: _side_and_rest(name) for name in candidates}
+    left, right = ([name for name, (name_side, _) in parts.items() if name_side == side]
                    for side in ('left', 'right'))
-    pairs = [(a, b) for a in left for b in right if rests[a] == rests[b]]
+    pairs = [(a, b) for a in left for b in right if parts[a][1] == parts[b][1]]
     if len(left) == len(right) == 1:
         pairs = [(left[0], right[0])]
     if 2 * len(pairs) != len({name for pair in pairs for name in pair}):
         return tuple(candidates)                      # one wheel in two pairs
     if len(pairs) == 1:
-        return Choice(pairs[0], True, _selection_text(names, pairs[0], ''))
+        return WheelChoice(pairs[0], True, _selection_text(names, pairs[0], ''))
     steered_axles = {_axle(_side_and_rest(name)[1]) for name in names
                      if _contains(name, STEERING_WORDS)} - {''}
     not_steered = [pair for pair in pairs
-                   if steered_axles and _axle(rests[pair[0]]) not in steered_axles]
-    rear = [pair for pair in pairs if _axle(rests[pair[0]]) == 'rear']
+                   if steered_axles and _axle(parts[pair[0]][1]) not in steered_axles]
+    rear = [pair for pair in pairs if _axle(parts[pair[0]][1]) == 'rear']
     for axle_pairs, reason in ((not_steered, ', axle that does not steer'), (rear, ', rear axle')):
         if len(axle_pairs) == 1:
-            all_names = ', '.join(name for pair in pairs for name in pair)
-            explanation = _selection_text(names, axle_pairs[0], reason)
-            return Choice(axle_pairs[0], True,
-                          f'{explanation}; for all wheels set odometer.wheels to [{all_names}]')
-    # a bicycle: of two wheels in line the front one steers
-    rear_wheels = [name for name in candidates if _axle(rests[name]) == 'rear']
+            wheels = ', '.join(name for pair in pairs for name in pair)
+            return WheelChoice(axle_pairs[0], True, (
+                f'{_selection_text(names, axle_pairs[0], reason)}; for all wheels set '
+                f'odometer.wheels to [{wheels}]'))
+    # of two wheels in line, as of a bicycle, the front one steers
+    rear_wheels = [name for name, (_, rest) in parts.items() if _axle(rest) == 'rear']
     return tuple(rear_wheels if len(candidates) == 2 and len(rear_wheels) == 1 else candidates)
 
 
@@ -153,8 +155,8 @@ def _axle_and_side(word: str) -> tuple[str, str]:
     if word in side or word in ('lh', 'rh'):
         return '', side[word[0]]
     for axle, letter in zip(word, word[::-1], strict=True) if len(word) == 2 else ():
-        if axle in LETTERS and letter in side:
-            return LETTERS[axle], side[letter]
+        if axle in AXLE_LETTERS and letter in side:
+            return AXLE_LETTERS[axle], side[letter]
     return '', ''
 
 
@@ -168,6 +170,6 @@ def _contains(name: str, words: Sequence[str]) -> bool:
 
 
 def _list_text(keys: Sequence[str]) -> str:
-    max_shown = 12
-    hidden_count = len(keys) - max_shown
-    return ', '.join(keys[:max_shown]) + (f' and {hidden_count} more' if hidden_count > 0 else '')
+    hidden_count = len(keys) - MAX_SHOWN_KEYS
+    return ', '.join(keys[:MAX_SHOWN_KEYS]) + (
+        f' and {hidden_count} more' if hidden_count > 0 else '')

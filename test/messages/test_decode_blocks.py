@@ -16,7 +16,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import readings_of
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import make_reader
-from odocal_ros.messages.message_fields import _fix, _heading
+from odocal_ros.messages.message_fields import _build_fixes, _build_headings
 from odocal_ros.settings.config import Config, with_settings
 
 
@@ -217,8 +217,8 @@ def test_a_signalling_nan_is_read_without_a_floating_point_error():
     position.view(np.uint64)[1] = 0x7ff0000000000001
     ns = np.zeros(2, np.int64)
     with np.errstate(all='raise'):
-        fixes = _fix(ns, ns, position, np.zeros((2, 9)), *np.zeros((2, 2, 1)))
+        fixes = _build_fixes(ns, ns, position, np.zeros((2, 9)), *np.zeros((2, 2, 1)))
         q_ni = np.pad(position, ((0, 0), (0, 1)))
-        heading = _heading(ns, ns, q_ni, np.ones((2, 1)), np.ones((2, 1)))
+        heading = _build_headings(ns, ns, q_ni, np.ones((2, 1)), np.ones((2, 1)))
     assert np.isnan(fixes.latitude).tolist() == [False, True]
     assert np.isnan(heading.yaw_variance).tolist() == [True, False]     # of zeros: no orientation
