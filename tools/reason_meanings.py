@@ -53,7 +53,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'wrong times.',
         Code.CLOCK_SET: 'The stamps of a topic step by 10 ms or more against their arrival times, '
         'and stay so: its clock was set. The stamps on one side of the step were shifted by the '
-        'same amount; if the clock is that of the IMU, the marks too.',
+        'same amount; if the clock is that of the IMU, the marks too. Messages that queue do not '
+        'look like this: within 10 s they arrive as before.',
         Code.CLOCKS_DRIFT: 'The delay of one sensor changes during the leg by more than three '
         'sigmas and 10 ms: its clock is faster or slower than that of the IMU. Quartz clocks '
         'differ by up to 100 ppm, 0.1 s in 17 minutes. The smoother estimates the rate and '

@@ -28,6 +28,7 @@ from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.clocks import without_clock_steps
 from odocal_ros.screening.imu_faults import gravity_turn_reasons, unit_change_reasons
 from odocal_ros.screening.imu_orientation import unit_and_axis_reasons, UNUSABLE
 from odocal_ros.screening.inputs import Inputs, locate_fixes
@@ -197,6 +198,8 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
             results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
         return [result for result in results if result.verdict is not Verdict.REJECTED]
 
+    leg, clock_steps = without_clock_steps(leg)      # a step forward is not a gap
+    notes = (*notes, *clock_steps)
     usable = usable_results(parts_between(leg, imu_gaps(leg, config.leg.max_gap)))
     cause, remedy = f'no IMU data for more than {config.leg.max_gap:g} s', ''
     if not usable:

@@ -39,6 +39,9 @@ MAX_CLOCK_OFFSET = 1.0     # s, larger ones are no delay. Format: range of a tim
 # judgement: least step of a clock that is detected, s; rows before and after it whose median lag
 # gives its size
 CLOCK_STEP, STEP_LAG_ROWS = 0.01, 50
+STEP_TOLERANCE = 0.3    # judgement: of its size, difference of two measures of one step
+# s, judgement: within it the least lag is again that of before if messages only queued
+QUEUE_TIME = 10.0
 OFFSET_CELL = 0.25          # s, judgement: time of a mean; accelerations of a vehicle take longer
 FARTHEST_OFFSET = 90.0      # s, judgement: largest offset that is found
 # s, judgement: slower changes of force (slopes) and of speed (traffic) are removed
@@ -167,11 +170,29 @@ def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
     for k in np.flatnonzero(is_unusual & (np.abs(advance) > CLOCK_STEP / 2)).tolist():
         first, last = max(k + 1 - STEP_LAG_ROWS, 0), k + STEP_LAG_ROWS
         size = float(np.median(lag[first:k + 1]) - np.median(lag[k + 1:last + 1]))
-        if (abs(size) >= CLOCK_STEP and abs(advance[k] - size) <= 0.3 * abs(size)
+        if (abs(size) >= CLOCK_STEP and abs(advance[k] - size) <= STEP_TOLERANCE * abs(size)
                 and (step[first:k] >= 0).all() and (step[k + 1:last] >= 0).all()):
             rows.append(k)
             sizes.append(size)
-    return np.array(rows, np.int64), np.array(sizes)
+    last_rows, size_s = np.array(rows, np.int64), np.array(sizes)
+    decrease = _decrease_of_least_lag(samples.received_ns, lag, last_rows)
+    stays = np.abs(decrease - size_s) <= STEP_TOLERANCE * np.abs(size_s)
+    return last_rows[stays], size_s[stays]
+
+
+def _decrease_of_least_lag(received_ns: Ints, lag: Floats, last_rows: Ints) -> Floats:
+    """
+    Return the least lag before the ends of sections minus that after them, (m,) s.
+
+    Within QUEUE_TIME and the adjacent sections.   last_rows : (m,) last rows of sections.
+    """
+    edges = np.concatenate([[0], last_rows + 1, [len(lag)]])
+    first, last = (np.searchsorted(received_ns, received_ns[last_rows] + sign * round(
+        QUEUE_TIME * 1e9)) for sign in (-1, 1))
+    first = np.minimum(np.maximum(first, edges[:-2]), last_rows)
+    last = np.maximum(np.minimum(last, edges[2:]), last_rows + 2)
+    return np.array([lag[i:k + 1].min() - lag[k + 1:j].min()
+                     for i, k, j in zip(first, last_rows, last, strict=True)])
 
 
 def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, float]]:

@@ -92,6 +92,23 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
             one.methods['smoother'].estimates[name].sigma for one in results), name
 
 
+@pytest.mark.parametrize('by', [0.6, 3.0])
+def test_a_leg_is_not_cut_where_the_imu_clock_is_set_forward(made, by):
+    leg, config = made.leg(), settings(made, method='two_point')
+    t, step_ns = seconds(leg, leg.imu), round(by * 1e9)
+    later = replace(leg, stop_ns=leg.stop_ns + step_ns, imu=replace(
+        leg.imu, stamp_ns=leg.imu.stamp_ns + step_ns * (t > 200.0)))
+    (alone,), (only,) = (calibrate_parts(one, config) for one in (leg, later))
+    codes = [reason.code for reason in only.reasons]
+    assert codes.count(Code.CLOCK_SET) == 1
+    assert not {Code.LEG_CUT, Code.IMU_GAP} & set(codes)
+    assert off(combine([only], config), made, SCALE) == pytest.approx(
+        off(combine([alone], config), made, SCALE), abs=1e-3)
+    # a real gap of 3 s in addition
+    (first,) = calibrate_parts(silent(later, (220.0 + by, 223.0 + by)), config)
+    assert 'covers 0.0 to 220.0 s of the 280.0 s leg' in first.reasons[-1].text
+
+
 def test_the_only_usable_section_is_not_called_the_only_long_one(made, monkeypatch):
     leg, config = made.leg(), settings(made, method='two_point')
 

@@ -80,6 +80,22 @@ def test_unstamped_or_disordered_rows_and_a_recorder_clock_are_no_clock_step(leg
     assert Code.CLOCK_SET not in screen_with(replace(leg, imu=set_by))[1]
 
 
+def test_queued_messages_with_a_gap_are_not_a_clock_step(leg):
+    """After a loss the lag is that of a queue, or it was before; soon it is the usual one."""
+    imu, t = leg.imu, seconds(leg, leg.imu)
+    queued = (t >= 101.0) & (t < 103.0)       # arrive together at 103 s, 10 us apart
+    arrival = np.where(queued, leg.start_ns + 103 * 10**9 + 10_000 * np.cumsum(queued),
+                       imu.received_ns)
+    burst = take(replace(imu, received_ns=arrival), (t < 100.0) | (t >= 101.0))
+    growing = np.where((t > 80.0) & (t < 100.0), (t - 80.0) / 10.0, 0.0)       # lag, s
+    full = take(replace(imu, received_ns=imu.received_ns + np.round(growing * 1e9).astype(int)),
+                (t < 100.0) | (t >= 102.0))
+    for other in (burst, full):
+        codes = screen_with(replace(leg, imu=other))[1]
+        assert Code.CLOCK_SET not in codes
+        assert Code.CLOCKS_DIFFER not in codes
+
+
 @pytest.mark.parametrize('late_s', [0.05, 0.3])
 def test_a_topic_that_arrives_again_later_is_not_a_clock_step(leg, late_s):
     again = replace(leg.fix, received_ns=leg.fix.received_ns + round(late_s * 1e9))
