@@ -79,7 +79,7 @@ def main():
     parted = max(np.abs(scores.mean[:LOOPED] - way).max() for way in (alone, pulses))
     print(f'  mean distances part by {parted:.1e} m')
     whole, found = timed(lambda: search(leg, search_ranges(WheelsConfig())))
-    print(f'  whole search ({len(found.sets)} rows, {found.refined.iterations} surfaces): '
+    print(f'  whole search ({len(found.sets)} rows, {found.surface_minimum.iterations} surfaces): '
           f'{whole:.2f} s')
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from odocal_ros.calib.drive import separated_fixes
-from odocal_ros.calib.track_check import PLAUSIBLE_RATIO
+from odocal_ros.calib.reversals import PLAUSIBLE_RATIO
 from odocal_ros.data.arrays import Floats, map_rows
 from odocal_ros.nav.geodesy import MIN_GNSS_MOTION
 from odocal_ros.nav.rotations import arctan2

@@ -5,13 +5,14 @@
 Several legs of a vehicle as one linear least-squares problem: docs/method.md (S35) to (S37).
 
 Input is the marginal information of each leg. All constants are the same in all legs, except one
-that drifts, ln K: a random walk from leg to leg. Output are the normal equations, their solution,
-and the residuals of legs.
+that drifts, ln K, the logarithm of the scale factor: a random walk from leg to leg. Output are the
+normal equations, their solution, and the residuals of legs.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -29,45 +30,51 @@ LEG_ROUNDING = 1e-12
 class LinkedEquations:
     """Normal equations H x = g of linked legs; n unknowns x as in ``LinkedLegs.equations``."""
 
-    H: Floats                            # (n, n)
-    g: Floats                            # (n,)
-    cost: float                          # weighted sum of squares at x = 0
-    prior: tuple[Floats, Floats, float]  # its part of the priors: diagonal of H, g, and cost
-    common_count: int                    # of unknowns common to all legs, the first ones of x
-    rank: int                            # of the information of the legs and the random walk
+    H: Floats                 # (n, n) with the priors, as g and cost
+    g: Floats                 # (n,)
+    cost: float               # weighted sum of squares at x = 0
+    prior_diagonal: Floats    # (n,) part of the priors in the diagonal of H
+    prior_g: Floats           # (n,)
+    prior_cost: float
+    common_count: int         # number of unknowns common to all legs, the first ones of x
+    rank: int                 # of the information of the legs and the random walk
 
     @cached_property
-    def _eigen(self) -> tuple[Floats, Floats, Floats]:
-        """Return eigenvalues of H with a unit diagonal, its eigenvectors, and the scale of x."""
-        scale = 1 / np.sqrt(np.maximum(np.diag(self.H), LEG_ROUNDING))
-        eigenvalues, V = np.linalg.eigh(self.H * np.multiply.outer(scale, scale))
-        return eigenvalues, V * scale[:, None], scale
+    def _scale(self) -> Floats:
+        """Return the factors on x with which the diagonal of H is 1: (n,)."""
+        return 1 / np.sqrt(np.maximum(np.diag(self.H), LEG_ROUNDING))
+
+    @cached_property
+    def _eigen(self) -> tuple[Floats, Floats]:
+        """Return the eigenvalues of H with a unit diagonal, and the eigenvectors in x."""
+        eigenvalues, V = np.linalg.eigh(self.H * np.multiply.outer(self._scale, self._scale))
+        return eigenvalues, V * self._scale[:, None]
 
     @property
     def log_determinant(self) -> float:
         """Return the log determinant of H."""
-        eigenvalues, _, scale = self._eigen
-        return float(np.log(np.maximum(eigenvalues, LEG_ROUNDING)).sum() - 2 * np.log(scale).sum())
+        log_scaled = np.log(np.maximum(self._eigen[0], LEG_ROUNDING)).sum()
+        return float(log_scaled - 2 * np.log(self._scale).sum())
 
     def minimum_cost(self) -> float:
         """Return the weighted sum of squares at the solution."""
-        eigenvalues, V, _ = self._eigen
+        eigenvalues, V = self._eigen
         return self.cost - float(((self.g @ V)**2) @ (1 / np.maximum(eigenvalues, LEG_ROUNDING)))
 
     def misfit(self) -> tuple[float, float]:
         """Return the chi-square of legs and random walk, and its degrees of freedom: (S36)."""
-        eigenvalues, V, _ = self._eigen
+        eigenvalues, V = self._eigen
         kept = eigenvalues > LEG_ROUNDING
         eigenvalues, V = eigenvalues[kept], V[:, kept]
         x = V @ (self.g @ V / eigenvalues)
-        weight, prior_g, prior_cost = self.prior
-        prior_chi2 = x @ (weight * x - 2 * prior_g) + prior_cost
-        fitted = len(eigenvalues) - float((weight @ V**2) @ (1 / eigenvalues))
+        prior_chi2 = x @ (self.prior_diagonal * x - 2 * self.prior_g) + self.prior_cost
+        fitted = len(eigenvalues) - float((self.prior_diagonal @ V**2) @ (1 / eigenvalues))
         return self.cost - float(self.g @ x + prior_chi2), self.rank - fitted
 
     def solve(self) -> tuple[Floats, Floats]:
-        """Return x and its covariance, with the drifting constant of each leg for its steps."""
-        eigenvalues, V, _ = self._eigen
+        """Return x, with the drifting constant of each leg instead of its steps; covariance."""
+        eigenvalues, V = self._eigen
+        # the drifting constant of a leg is the sum of the unknowns from its step to the last one
         summed = V.copy()
         summed[self.common_count:] = np.cumsum(V[self.common_count:][::-1], axis=0)[::-1]
         eigenvalues = np.maximum(eigenvalues, LEG_ROUNDING)
@@ -91,7 +98,7 @@ class LinkedLegs:
         """
         Take the marginal information of legs in order of time.
 
-        drifting : name of the constant with a random walk.   steps : (J - 1,) sigma of its change
+        drifting : name of the constant with a random walk.   steps : (J - 1,) sigmas of its change
         from leg to leg.   angles : names of constants with a period of one turn.
         """
         self.names = tuple(dict.fromkeys(name for leg in marginals for name in leg.names))
@@ -110,18 +117,16 @@ class LinkedLegs:
         self.steps = np.maximum(steps, 1e-7)
 
     def combine_sections(self, same_drive: Sequence[bool]) -> 'LinkedLegs':
-        """Return the drives, with the information of their sections added up."""
-        # same_drive : (J - 1,) True if a leg is of the same drive as the leg before
-        is_new_drive = [not is_same for is_same in same_drive] or [True] * len(self.steps)
-        if all(is_new_drive):
+        """Return the drives; same_drive: (J - 1,) True if a leg continues the drive before it."""
+        if not any(same_drive):
             return self
         marginals = self.marginals[:1]
-        for marginal, is_new in zip(self.marginals[1:], is_new_drive, strict=True):
-            if is_new:
-                marginals.append(marginal)
-            else:
+        for marginal, is_same in zip(self.marginals[1:], same_drive, strict=True):
+            if is_same:
                 marginals[-1] = marginals[-1].plus(marginal)
-        return LinkedLegs(marginals, self.names[self.drifting], self.steps[is_new_drive])
+            else:
+                marginals.append(marginal)
+        return LinkedLegs(marginals, self.names[self.drifting], self.steps[~np.array(same_drive)])
 
     def replace_marginals(self, marginals: list[MarginalInformation]) -> None:
         """Set the marginals of the legs; each must have the names of all."""
@@ -129,14 +134,10 @@ class LinkedLegs:
         self._information: dict[float, LegInformation] = {}
 
     def information(self, min_information: float = 0.0) -> 'LegInformation':
-        """
-        Return the information of the legs, in directions with at least some information.
-
-        min_information : in units of that of the priors.
-        """
+        """Return the legs' information where it exceeds a minimum, in units of the priors'."""
         if min_information not in self._information:      # requested for each constant
-            self._information[min_information] = _in_units(
-                self.marginals, self.unit, min_information)
+            self._information[min_information] = _in_units(self.marginals, self.unit,
+                                                           min_information)
         return self._information[min_information]
 
     def indices(self, j: int) -> Ints:
@@ -154,28 +155,36 @@ class LinkedLegs:
 
         scatter : sigma between legs, by constant.   prior : include the priors.
         """
-        H, g, cost, rank = self._leg_equations(legs, scatter)
+        equations = self._leg_equations(legs, scatter)
         common, steps = len(self.names) - 1, len(self.steps)
         walk = np.arange(common, common + steps)
-        H[walk, walk] += (self.unit[self.drifting] / self.steps)**2
-        weight, offset = np.zeros((2, len(g)))
+        equations.H[walk, walk] += (self.unit[self.drifting] / self.steps)**2
+        weight, offset = np.zeros((2, len(equations.g)))
         if prior:
             last = self.indices(steps)      # of the constants of the last leg
             weight[last] = np.isfinite(self.relaxed_sigma)
             offset[last] = (self.prior_mean - self.marginals[-1].point) / self.unit
-        prior_cost = float(weight @ offset**2)
-        return LinkedEquations(H + np.diag(weight), g + weight * offset, cost + prior_cost,
-                               (weight, weight * offset, prior_cost), common, rank + steps)
+        prior_g, prior_cost = weight * offset, float(weight @ offset**2)
+        return LinkedEquations(equations.H + np.diag(weight), equations.g + prior_g,
+                               equations.cost + prior_cost, weight, prior_g, prior_cost, common,
+                               equations.rank + steps)
 
-    def _leg_equations(self, legs: 'LegInformation', scatter: dict[str, float] | None,
-                       ) -> tuple[Floats, Floats, float, int]:
-        """Return H, g, the cost at x = 0 and the rank of the information of the legs alone."""
+    def _leg_equations(self, legs: 'LegInformation',
+                       scatter: dict[str, float] | None) -> LinkedEquations:
+        """Return the equations of the legs alone, without random walk and priors."""
         # with the scatter eliminated, a leg has the information D - T DA'. Its drifting constant
         # is the sum of the steps from this leg on, so rows and columns of a step are sums over the
         # legs up to it
         J, k = len(legs.D), self.drifting
         common = np.delete(np.arange(len(self.names)), k)
-        T, DA, gradient, rank = self._eliminate_scatter(legs, scatter)
+        indices = [self.names.index(name) for name in scatter or ()]
+        sigmas = np.array(list((scatter or {}).values())) / self.unit[indices]
+        T, DA, A = eliminate_leg_errors(legs.D, indices, sigmas)
+        # the information of legs combined earlier already includes their scatter
+        T[[bool(leg.scatter_likelihood) for leg in self.marginals]] = 0.0
+        unbounded = (np.isinf(sigmas) & T.any(axis=1)).sum()
+        errors = np.swapaxes(A, 1, 2) @ legs.gradient[:, :, None]
+        gradient = legs.gradient - (T @ errors)[:, :, 0]
         last = self.marginals[-1].point
         offset = np.stack([leg.point - last for leg in self.marginals]) / self.unit
         g_legs = gradient + (legs.D @ offset[:, :, None]
@@ -183,10 +192,13 @@ class LinkedLegs:
         cost = float((offset * (g_legs + gradient)).sum() + (legs.estimate * gradient).sum())
         drifting = legs.D[:, :, k] - np.einsum('jas,js->ja', T, DA[:, k])    # (J, m) column k
         total = legs.D.sum(axis=0) - np.tensordot(T, DA, ((0, 2), (0, 2)))
-        by_step = np.cumsum(drifting[:, common], axis=0)
+        cross = np.cumsum(drifting[:, common], axis=0)        # of steps and common constants
+        # of two steps: the sum over the legs up to the earlier one
         steps = np.cumsum(drifting[:, k])[np.minimum.outer(np.arange(J), np.arange(J))]
-        return (np.block([[total[np.ix_(common, common)], by_step.T], [by_step, steps]]),
-                np.concatenate([g_legs.sum(axis=0)[common], np.cumsum(g_legs[:, k])]), cost, rank)
+        H = np.block([[total[np.ix_(common, common)], cross.T], [cross, steps]])
+        g = np.concatenate([g_legs.sum(axis=0)[common], np.cumsum(g_legs[:, k])])
+        return LinkedEquations(H, g, cost, np.zeros(len(g)), np.zeros(len(g)), 0.0, len(common),
+                               int(legs.rank.sum() - unbounded))
 
     def solve(self, scatter: dict[str, float] | None = None) -> tuple[Floats, Floats]:
         """Return constants and covariance, SI units; those of leg j are at ``indices(j)``."""
@@ -245,18 +257,6 @@ class LinkedLegs:
             residuals[j, tested] = gradient[tested] / np.sqrt(variance[tested])
         return residuals
 
-    def _eliminate_scatter(self, legs: 'LegInformation', scatter: dict[str, float] | None
-                           ) -> tuple[Floats, Floats, Floats, int]:
-        """Return T, DA of ``eliminate_leg_errors``, remaining gradient, and the sum of ranks."""
-        # T is zero for legs combined earlier: their information already includes their scatter
-        indices = [self.names.index(name) for name in scatter or ()]
-        sigmas = np.array(list((scatter or {}).values())) / self.unit[indices]
-        T, DA, A = eliminate_leg_errors(legs.D, indices, sigmas)
-        T[[bool(leg.scatter_likelihood) for leg in self.marginals]] = 0.0
-        unbounded = (np.isinf(sigmas) & T.any(axis=1)).sum()
-        errors = np.swapaxes(A, 1, 2) @ legs.gradient[:, :, None]
-        return T, DA, legs.gradient - (T @ errors)[:, :, 0], int(legs.rank.sum() - unbounded)
-
 
 @dataclass(frozen=True, eq=False)
 class LegInformation:
@@ -287,14 +287,11 @@ def _with_names(marginal: MarginalInformation, names: tuple[str, ...]) -> Margin
     if marginal.names == names:
         return marginal
     indices = [names.index(name) for name in marginal.names]
-    m = len(names)
-    D = np.zeros((m, m))
+    D = np.zeros((len(names), len(names)))
     D[np.ix_(indices, indices)] = marginal.information
-
-    def expand(values: Floats) -> Floats:
-        expanded = np.zeros(m)       # sigma 0: has no effect in the maximum over legs
-        expanded[indices] = values
-        return expanded
-    return MarginalInformation(
-        names, expand(marginal.point), D, expand(marginal.gradient), expand(marginal.prior_mean),
-        expand(marginal.prior_sigma), expand(marginal.relaxed_sigma), marginal.scatter_likelihood)
+    fields = ('point', 'gradient', 'prior_mean', 'prior_sigma', 'relaxed_sigma')
+    # a prior sigma of 0 has no effect in the maximum over legs
+    vectors: dict[str, Any] = {field: np.zeros(len(names)) for field in fields}
+    for field, vector in vectors.items():
+        vector[indices] = getattr(marginal, field)
+    return replace(marginal, names=names, information=D, **vectors)

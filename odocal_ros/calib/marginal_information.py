@@ -105,10 +105,11 @@ class MarginalInformation:
 def eliminate_leg_errors(D: Floats, indices: list[int],
                          sigmas: Floats) -> tuple[Floats, Floats, Floats]:
     """
-    Return T, DA and A, (..., m, k), that eliminate errors of k constants in each leg: (S34).
+    Return T, DA and A of docs/method.md (S34): (..., m, k).
 
-    The information D is reduced by T DA', the gradient h by T A' h.   D : (..., m, m).
-    indices, sigmas : (k,) of the constants, and sigmas of their errors; inf: unbounded.
+    They eliminate errors of k constants in each leg: the information D is reduced by T DA', the
+    gradient h by T A' h.   D : (..., m, m).   indices, sigmas : (k,) of the constants, and sigmas
+    of their errors; inf: unbounded.
     """
     bounded, diagonal = np.isfinite(sigmas), np.diagonal(D, axis1=-2, axis2=-1)[..., indices]
     # the column of an unbounded error may have any length

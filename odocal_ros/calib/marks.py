@@ -12,6 +12,7 @@ constant during a mark are observable along the leg, but not at the mark.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,15 +41,23 @@ class MarkFix:
     position_n: Floats         # (3,) m
     covariance_n: Floats       # (3, 3) m^2
     standing: bool             # True: averaged at rest
-    used: int                  # number of fixes
+    fix_count: int             # number of fixes used
     height_known: bool = True  # False if any fix has no height
     surveyed: bool = False     # True: from settings
 
 
+class MeanFix(NamedTuple):
+    """Mean of the fixes of one place."""
+
+    position_n: Floats      # (3,) m
+    covariance_n: Floats    # (3, 3) m^2
+    fix_count: int          # number of fixes used, without outliers
+
+
 def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
-             correlation_time: float = np.nan) -> tuple[Floats, Floats, int]:
+             correlation_time: float = np.nan) -> MeanFix:
     """
-    Return mean, (3,) m, covariance, (3, 3) m^2, and used fixes of one place: (T6), (T7).
+    Return the mean of the fixes of one place: docs/method.md (T6), (T7).
 
     t : (n,) times, s.   position_n : (n, 3) fixes, m, motion removed.   covariance_n : (n, 3, 3)
     stated, m^2.   correlation_time : of the errors, s; 0: white; NaN: estimated from the data.
@@ -60,7 +69,7 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
     mean = weight @ position_n
     fix_covariance = np.einsum('n,nij->ij', weight, covariance_n)      # of a single fix
     share = _variance_share(t, position_n - mean, fix_covariance, weight, correlation_time)
-    return mean, fix_covariance * share, int(keep.sum())
+    return MeanFix(mean, fix_covariance * share, int(keep.sum()))
 
 
 def _inliers(position_n: Floats, covariance_n: Floats) -> Bools:
@@ -80,24 +89,25 @@ def _variance_share(t: Floats, residual: Floats, fix_covariance: Floats, weight:
     # without a known correlation time, scatter and steps from fix to fix show whether errors are
     # white, or how large their fast and their slow part are
     n = len(t)
-    white = float(weight @ weight)          # 1/n for equal weights
+    white_share = float(weight @ weight)          # 1/n for equal weights
     if n == 1 or correlation_time == 0:
-        return white
+        return white_share
     if not np.isnan(correlation_time):
         return _mean_variance_share(t, weight, correlation_time)
     if n < MIN_SCATTERED_FIXES:
         return 1.0
-    # for white errors, both of these are 1, within 3 sigma of their own noise
+    # variances of z, residuals over stated sigmas: for white errors, both are 1, within 3 sigma of
+    # their own noise
     z = residual[:, :2] / np.sqrt(np.diag(fix_covariance))[:2]
     scatter = (z**2).sum() / (2 * (n - 1))
     half_square_step = (np.diff(z, axis=0)**2).mean() / 2
     tolerance = 3 * np.sqrt(1 / n)
     if scatter > 1 - tolerance and half_square_step > scatter * (1 - tolerance):
-        return white * (scatter if scatter > 1 + tolerance else 1.0)
-    fast = min(half_square_step, 1.0)
-    slow = max(1.0, scatter) - fast
-    tau = _correlation_time(t, z, fast, slow)
-    return float(fast * white + slow * _mean_variance_share(t, weight, tau))
+        return white_share * (scatter if scatter > 1 + tolerance else 1.0)
+    fast_part = min(half_square_step, 1.0)
+    slow_part = max(1.0, scatter) - fast_part
+    tau = _correlation_time(t, z, fast_part, slow_part)
+    return float(fast_part * white_share + slow_part * _mean_variance_share(t, weight, tau))
 
 
 def _mean_variance_share(t: Floats, weight: Floats, tau: float) -> float:
@@ -111,15 +121,15 @@ def _mean_variance_share(t: Floats, weight: Floats, tau: float) -> float:
     return float(max(w @ correlation @ w, weight @ weight))
 
 
-def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:
+def _correlation_time(t: Floats, z: Floats, fast_part: float, slow_part: float) -> float:
     """Return the correlation time of the slow part, s: structure function at a quarter window."""
-    # z : (n, 2) residuals over stated sigmas.  fast, slow : variances of the two parts of z
+    # z : (n, 2) residuals over stated sigmas.  fast_part, slow_part : their variances in z
     lag = max(1, len(t) // 4)
-    growth = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast      # slow (1 - correlation)
-    decorrelated = np.clip(growth / slow, 0.0, 0.95) if slow > 0 else 0.95
-    if decorrelated <= 0:
+    growth = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast_part    # slow_part (1 - correlation)
+    one_minus_correlation = np.clip(growth / slow_part, 0.0, 0.95) if slow_part > 0 else 0.95
+    if one_minus_correlation <= 0:
         return np.inf
-    return float(np.median(t[lag:] - t[:-lag]) / -np.log1p(-decorrelated))
+    return float(np.median(t[lag:] - t[:-lag]) / -np.log1p(-one_minus_correlation))
 
 
 def standing_at(t_mark: float, spans: Floats | Sequence[tuple[float, float]],
@@ -152,20 +162,26 @@ def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats,
     at_mark = position_n[rows] - displacement_n(t[rows])
     height_known = bool(np.isfinite(at_mark[:, 2]).all())
     at_mark = np.where(np.isfinite(at_mark), at_mark, 0.0)
-    mean, covariance, used = mean_fix(t[rows], at_mark, covariance_n[rows], correlation_time)
-    return MarkFix(t_mark, mean, covariance, span is not None, used, height_known)
+    mean = mean_fix(t[rows], at_mark, covariance_n[rows], correlation_time)
+    return MarkFix(t_mark, mean.position_n, mean.covariance_n, span is not None, mean.fix_count,
+                   height_known)
 
 
-def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]:
-    """
-    Return number of rows, window number and column means, (k,) each, of windows with enough rows.
+class WindowMeans(NamedTuple):
+    """Means of columns over k windows of SLOW_WINDOW with enough rows."""
 
-    t : (n,) s; windows of SLOW_WINDOW begin at the first.   columns : (n,) each.
-    """
+    rows: Ints              # (k,) their number in each window
+    number: Ints            # (k,) number of the window, from 0: those with few rows are missing
+    means: list[Floats]     # (k,) of each column
+
+
+def window_means(t: Floats, *columns: Floats) -> WindowMeans:
+    """Return means of columns, (n,) each, over windows that begin at the first of t, (n,) s."""
     window = ((t - t[0]) / SLOW_WINDOW).astype(int)
     count = np.bincount(window)
     full = np.flatnonzero(count >= max(5, 0.5 * count.max()))
-    return count[full], full, [np.bincount(window, x)[full] / count[full] for x in columns]
+    return WindowMeans(count[full], full,
+                       [np.bincount(window, x)[full] / count[full] for x in columns])
 
 
 def slow_variance(t: Floats, along: Floats, place: Floats, variance: Floats,
@@ -181,20 +197,20 @@ def slow_variance(t: Floats, along: Floats, place: Floats, variance: Floats,
     t, along, place : (n,) s, corrected track minus fixes along the chord, m, and position there,
     m.   variance : (n,) stated, m^2.   drift : possible track error by gyro drift along it, m.
     """
-    count, number, (means, places) = window_means(t, along, place)
-    if len(count) < 5:      # after mean and slope, a variance by five has a sigma of 80 %
+    windows = window_means(t, along, place)
+    if len(windows.rows) < 5:      # after mean and slope, a variance by five has a sigma of 80 %
         return 0.0, np.inf
-    means, places = means - means.mean(), places - places.mean()
+    means, places = (x - x.mean() for x in windows.means)
     means = means - places * (places @ means) / max(places @ places, 1e-9)
-    freedom = len(count) - 2
+    freedom = len(means) - 2
     # median of a squared normal deviate: 0.4549
     fix_to_fix = np.median(np.diff(along)**2) / 0.4549 / 2
-    white = min(fix_to_fix, np.median(variance)) / np.median(count)
+    white = min(fix_to_fix, np.median(variance)) / np.median(windows.rows)
     total = (means**2).sum() / freedom - drift**2
     # within three sigmas of the mean square by white errors alone
     if total <= white * (1 + 3 * np.sqrt(2 / freedom)):
         return 0.0, np.inf
-    products = (means[1:] * means[:-1])[np.diff(number) == 1]
+    products = (means[1:] * means[:-1])[np.diff(windows.number) == 1]     # of adjacent windows
     correlation = (products.mean() - drift**2) / (total - white) if len(products) else 1.0
     return float(total - white), _time_constant(correlation)
 
@@ -218,21 +234,21 @@ def with_slow_errors(mark: MarkFix, slow: float, tau: float, span: tuple[float, 
     """
     Return a mark with at least the variance of the slow fix errors.
 
-    The variance by the fixes at a mark is as reliable as that by the leg, if it includes slow
+    The variance from the fixes at a mark is as reliable as that from the leg, if it includes slow
     errors: it is increased only if it is that of white errors, or if the leg has clearly more.
 
-    mark : with the variance by its fixes.   slow, tau : as slow_variance returns them.   span :
-    (begin, end) of the standstill at the mark, s; None in motion.   stated : variance of one fix,
-    m^2.   up_ratio : variance up over that of a horizontal axis.
+    mark : with the variance from its fixes.   slow, tau : variance and correlation time from
+    ``slow_variance``.   span : (begin, end) of the standstill at the mark, s; None in motion.
+    stated : variance of one fix, m^2.   up_ratio : variance up over that of a horizontal axis.
     """
     begin, end = span or (mark.t, mark.t)
-    by_leg = slow * slow_share(end - begin, tau)
-    by_mark = (mark.covariance_n[0, 0] + mark.covariance_n[1, 1]) / 2
+    leg_variance = slow * slow_share(end - begin, tau)
+    mark_variance = (mark.covariance_n[0, 0] + mark.covariance_n[1, 1]) / 2
     unclear = 2.0       # ratio of variances: below, neither of two estimates is better
-    is_white = by_mark * mark.used < unclear * stated
-    if mark.surveyed or not (is_white or by_leg > unclear * by_mark):
+    is_white = mark_variance * mark.fix_count < unclear * stated
+    if mark.surveyed or not (is_white or leg_variance > unclear * mark_variance):
         return mark
-    increase = max(0.0, by_leg - by_mark) * np.diag([1.0, 1.0, up_ratio])
+    increase = max(0.0, leg_variance - mark_variance) * np.diag([1.0, 1.0, up_ratio])
     return replace(mark, covariance_n=mark.covariance_n + increase)
 
 
@@ -242,16 +258,16 @@ def marks_with_slow_errors(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Flo
     """
     Return both marks of a leg with at least the variance of its slow fix errors.
 
-    marks : with the variance by their fixes.   spans : (k, 2) standstills, s.   t, path_n,
+    marks : with the variance from their fixes.   spans : (k, 2) standstills, s.   t, path_n,
     residual, covariance_n : (n,), (n, 3), (n, 3), (n, 3, 3) times of the fixes, s, corrected track
     there, m, track minus fix, m, and stated covariance, m^2.   chord_n : (3,) from mark to mark,
     m.   drift_n : (3, k) possible track error by gyro drift, m.
     """
     along = chord_n[:2] / np.hypot(*chord_n[:2])
     stated = np.einsum('nij,i,j->n', covariance_n[:, :2, :2], along, along)
-    slow, tau = slow_variance(t, residual[:, :2] @ along, path_n[:, :2] @ along, stated,
-                              float(np.linalg.norm(along @ drift_n[:2])))
+    variance, tau = slow_variance(t, residual[:, :2] @ along, path_n[:, :2] @ along, stated,
+                                  float(np.linalg.norm(along @ drift_n[:2])))
     up_ratio = np.median(covariance_n[:, 2, 2] / stated)
-    start, end = (with_slow_errors(mark, slow, tau, standing_at(mark.t, spans), np.median(stated),
-                                   up_ratio) for mark in marks)
+    start, end = (with_slow_errors(mark, variance, tau, standing_at(mark.t, spans),
+                                   np.median(stated), up_ratio) for mark in marks)
     return start, end

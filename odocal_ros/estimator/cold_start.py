@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.track_check import cut_sections, find_inliers
+from odocal_ros.calib.reversals import cut_sections
+from odocal_ros.calib.track_check import find_inliers
 from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.estimator.factors.odometer import odometer_speed
 from odocal_ros.estimator.imu import gyro_bias_at_rest, ImuSteps

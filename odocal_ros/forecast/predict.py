@@ -190,10 +190,9 @@ def _expected_mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
     low, high = max(low, drive.t[0]), min(high, drive.duration)
     n = max(1, int((high - low) * sigmas.fix_rate))
     times = low + np.arange(n) / sigmas.fix_rate
-    _, covariance, used = mean_fix(times, np.zeros((n, 3)),
-                                   np.tile(sigmas.covariance_n, (n, 1, 1)),
-                                   sigmas.correlation_time)
-    return MarkFix(t, position_n, covariance, span is not None, used)
+    mean = mean_fix(times, np.zeros((n, 3)), np.tile(sigmas.covariance_n, (n, 1, 1)),
+                    sigmas.correlation_time)
+    return MarkFix(t, position_n, mean.covariance_n, span is not None, mean.fix_count)
 
 
 def _velocity_change(track: Track, marks: tuple[MarkFix, MarkFix]) -> Floats:

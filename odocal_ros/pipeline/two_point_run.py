@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib import track_check
+from odocal_ros.calib import reversals, track_check
 from odocal_ros.calib.budget import drift_sources
 from odocal_ros.calib.drive import fix_white_noise
 from odocal_ros.calib.marks import MarkFix, marks_with_slow_errors
@@ -181,11 +181,11 @@ class TwoPointRun:
         # track errors count as noise
         keep, _ = track_check.find_inliers(residual, prepared.fix_sigma)
         sigma = max(prepared.fix_sigma, fix_white_noise(p[keep]))
-        sections = track_check.cut_sections(
+        sections = reversals.cut_sections(
             prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma)
-        reversals = track_check.reversal_reasons(sections, self.config.odometer.signed)
-        self.data_reasons += reversals
-        if not reversals:
+        reversed_reasons = reversals.reversal_reasons(sections, self.config.odometer.signed)
+        self.data_reasons += reversed_reasons
+        if not reversed_reasons:
             residuals = track_check.track_residuals(prepared.path(f), two_point.start, fixes)
             statistics = track_check.track_statistics(residuals, prepared.distance)
             self.reasons += track_check.distance_reasons(

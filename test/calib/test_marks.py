@@ -125,7 +125,7 @@ def test_mark_in_motion_is_fitted_with_the_motion_removed():
                   lambda times: (times - 10.3)[:, None] * velocity, np.nan, 2.0)
     np.testing.assert_allclose(mark.position_n, 10.3 * velocity, atol=1e-12)
     assert not mark.standing
-    assert mark.used == 8
+    assert mark.fix_count == 8
 
 
 def at_rest(mark, span, t, p, correlation_time=np.nan):
@@ -137,7 +137,7 @@ def at_rest(mark, span, t, p, correlation_time=np.nan):
 def test_mark_without_fixes_is_none_and_without_heights_has_an_unknown_height():
     t, p = np.arange(5.0), np.ones((5, 3))
     assert at_rest(20.0, None, t, p) is at_rest(20.0, (15.0, 25.0), t, p) is None
-    assert at_rest(5.5, (5.0, 25.0), t, p).used == 1
+    assert at_rest(5.5, (5.0, 25.0), t, p).fix_count == 1
     assert at_rest(0.0, (0.0, 1.0), t[:0], p[:0]) is None
     p[3, 2] = np.nan
     mark = at_rest(2.0, (0.0, 4.0), t, p)

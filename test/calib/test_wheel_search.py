@@ -30,18 +30,18 @@ def test_left_and_right_scales_of_cars_move_together_with_a_reason(name):
     made, leg = simulated(**DRIVES[name])
     found = search(leg, RANGES)
     assert found.ratio_is_fixed
-    ratio = found.refined_set[1] / found.refined_set[0]
+    ratio = found.surface_set[1] / found.surface_set[0]
     assert ratio == pytest.approx(leg.scale_right / leg.scale_left, rel=1e-12)
     codes = {r.code for r in found.reasons}
     assert Code.WHEELS_NOT_SEPARABLE in codes
     assert Code.SEARCH_NOT_SETTLED not in codes
-    assert found.free.correlation[0, 1] < -0.999
-    assert found.free.condition > 1000
+    assert found.free_minimum.correlation[0, 1] < -0.999
+    assert found.free_minimum.condition > 1000
     # the mean is the harmonic mean of both counters; start and end fixes of
     # 1.5 m (straight: averaged at rest) or 2 cm over 2 to 11 km, gyro drift 1e-4 and less
-    mean = found.refined_set[:2].mean()
+    mean = found.surface_set[:2].mean()
     assert mean == pytest.approx(made.truth.scale, rel=6e-4)
-    assert found.after.rms[0] < 0.1 * found.before.rms[0]
+    assert found.surface_scores.rms[0] < 0.1 * found.start_scores.rms[0]
 
 
 def test_small_lawn_separates_left_and_right():
@@ -49,12 +49,12 @@ def test_small_lawn_separates_left_and_right():
     found = search(leg, RANGES)
     assert not found.ratio_is_fixed
     assert found.reasons == ()
-    z = (found.refined_set - TRUE) / found.free.sigma
+    z = (found.surface_set - TRUE) / found.free_minimum.sigma
     assert (np.abs(z) < 4).all()
     assert found.best == np.argmin(found.scores.mean)
     assert len(found.sets) == 49
-    assert found.after.rms[0] <= found.scores.rms.min()
-    assert_allclose(found.refined_set, found.direct_set, atol=1e-5)
+    assert found.surface_scores.rms[0] <= found.scores.rms.min()
+    assert_allclose(found.surface_set, found.squares_set, atol=1e-5)
     # levels have equal steps and include zero
     for k, half in enumerate(RANGES.half_range):
         x = np.unique(np.round((found.sets[:, k] - (k < 2)), 12))
@@ -70,7 +70,7 @@ def test_range_is_widened_if_the_minimum_is_on_its_edge():
     widened = next(r for r in found.reasons if r.code is Code.SEARCH_WIDENED)
     assert 'left ± 5 % to ± 40 %' in widened.text
     assert 'heading ± 10 deg to ± 80 deg' in widened.text
-    assert_allclose(found.refined_set - [0.0, 0.0, np.deg2rad(60.0)], TRUE, atol=0.01)
+    assert_allclose(found.surface_set - [0.0, 0.0, np.deg2rad(60.0)], TRUE, atol=0.01)
 
 
 def turned(degrees):
@@ -85,9 +85,9 @@ def test_unknown_heading_is_found(heading):
     away = replace(leg, left_n=leg.left_n @ turned(-heading),
                    right_n=leg.right_n @ turned(-heading))
     found = search(away, search_ranges(WheelsConfig(heading_range=np.pi)))
-    off = found.refined_set[2] - TRUE[2] - np.deg2rad(heading)
+    off = found.surface_set[2] - TRUE[2] - np.deg2rad(heading)
     assert np.angle(np.exp(1j * off)) == pytest.approx(0.0, abs=1e-3)
-    assert abs(found.refined_set[2]) <= np.pi
+    assert abs(found.surface_set[2]) <= np.pi
 
 
 def test_search_without_convergence_stops_and_is_reported():
@@ -95,8 +95,8 @@ def test_search_without_convergence_stops_and_is_reported():
     found = search(replace(leg, scale_left=0.4, scale_right=0.4), RANGES)
     texts = {r.code: r.text for r in found.reasons}
     assert 'widest range' in texts[Code.SEARCH_NOT_SETTLED]
-    assert found.refined.on_edge
-    assert_allclose(found.refined.half_range[:2], 0.9)
+    assert found.surface_minimum.on_edge
+    assert_allclose(found.surface_minimum.half_range[:2], 0.9)
     nothing = replace(leg, left_n=0 * leg.left_n, right_n=0 * leg.right_n)
     blind = search(nothing, RANGES)
     assert blind.ratio_is_fixed
@@ -111,7 +111,7 @@ def test_robust_fit_is_not_shifted_by_outliers():
     fixes[::20] += [15.0, 5.0]
     hit = replace(leg, fixes_n=fixes)
     plain, robust = (search(hit, RANGES, robust=r) for r in (False, True))
-    off = [np.abs(f.refined_set - TRUE)[[0, 1]].mean() for f in (plain, robust)]
+    off = [np.abs(f.surface_set - TRUE)[[0, 1]].mean() for f in (plain, robust)]
     assert off[1] < 0.2 * off[0]
 
 

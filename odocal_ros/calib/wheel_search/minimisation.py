@@ -21,10 +21,10 @@ from odocal_ros.calib.wheel_search.parameter_sets import parameter_sets, Space
 from odocal_ros.calib.wheel_search.planar import coefficients, inflation, loss, PlanarLeg, weights
 from odocal_ros.data.arrays import Bools, Floats
 
-STEP_LIMIT = 1e-11   # judgement: relative, rad, largest last step
-HALVINGS = 40        # judgement: of a step, at most
+STEP_LIMIT = 1e-11   # judgement: relative, rad; largest step of a converged iteration
+HALVINGS = 40        # judgement: largest number of halvings of a step
 DIFFERENCE = np.array([-1.0, 1.0, 0.0])    # definition: right minus left
-TRACK_BEND = 1e-4    # judgement: share of path length: bend of any track by gyro, slip, tyres
+TRACK_BEND = 1e-4    # judgement: bend of any track by gyro, slip, tyres over path length
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,8 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
-    """Minimum of a criterion by response surfaces."""
+class SurfaceMinimum:
+    """Minimum of a criterion, found by response surfaces."""
 
     x: Floats           # (3,) left, right (relative), heading (rad)
     value: float        # of the criterion there
@@ -59,26 +59,25 @@ def fit_surface(y: Floats, values: Floats) -> Surface:
     i, j = np.triu_indices(n)
     design = np.hstack([np.ones((len(y), 1)), y, y[:, i] * y[:, j]])
     middle = values.mean()      # removed, so that its rounding is not fitted
-    c = np.linalg.lstsq(design, values - middle, rcond=None)[0]
+    c = np.linalg.lstsq(design, values - middle, rcond=None)[0]      # coefficients
     residual = values - middle - design @ c
     hessian = np.zeros((n, n))
     hessian[i, j] = c[1 + n:]
-    spread, reach = ((values - middle)**2).sum(), np.ptp(values)
+    total_square, value_range = ((values - middle)**2).sum(), np.ptp(values)
     return Surface(float(c[0] + middle), c[1:1 + n], hessian + hessian.T,
-                   float(1 - (residual**2).sum() / spread) if spread > 0 else 1.0,
-                   float(np.abs(residual).max() / reach) if reach > 0 else 0.0)
+                   float(1 - (residual**2).sum() / total_square) if total_square > 0 else 1.0,
+                   float(np.abs(residual).max() / value_range) if value_range > 0 else 0.0)
 
 
 def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats) -> Floats:
     """
-    Return the minimum of a quadratic in a box: exact for any signs of its curvature.
+    Return the minimum of a quadratic in a box, exact for any signs of its curvature.
 
-    The minimum is stationary on one of the box's faces, including interior and corners: 27 faces
-    for three parameters.
+    It is stationary on one of the box's faces, interior and corners included: 27 for three
+    parameters.
     """
-    n = len(gradient)
-    best, lowest = np.zeros(n), np.inf     # at least a corner is found
-    for face in product((None, low, high), repeat=n):
+    best, lowest = np.zeros(len(gradient)), np.inf     # at least a corner is found
+    for face in product((None, low, high), repeat=len(gradient)):
         free = np.array([side is None for side in face])
         y = np.array([0.0 if side is None else side[k] for k, side in enumerate(face)])
         if free.any():
@@ -93,7 +92,7 @@ def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats)
 
 
 def refine(criterion: Callable[..., Any], x: Floats, width: Floats, half_range: Floats,
-           space: Space, widen: bool = True) -> Refined:
+           space: Space, widen: bool = True) -> SurfaceMinimum:
     """
     Return the minimum of a criterion by response surfaces.
 
@@ -102,41 +101,39 @@ def refine(criterion: Callable[..., Any], x: Floats, width: Floats, half_range: 
     half_range : (3,) half of the search range about zero.   space : free parameters.   widen :
     double the range if the minimum is on its edge.
     """
-    search = _BoxSearch(criterion, space, np.asarray(half_range, dtype=float),
-                        np.asarray(width, dtype=float), x)
+    search = _BoxSearch(criterion, space, half_range, width, x)
     first = last = search.surface()
     iterations, max_iterations = 1, 300    # surfaces; with the widest range a hundred are needed
     while True:
         converged = search.step(last)
-        if converged and search.on_edge.any():
-            if not (widen and search.widen()):
-                break
+        if converged and search.on_edge.any() and widen and search.widen():
             converged = False
         if converged or iterations == max_iterations:
             break
         last = search.surface()
         iterations += 1
-    return Refined(space.T @ search.q, search.least, iterations, converged, search.half_range,
-                   bool((search.half_range > search.first_half_range).any()),
-                   bool(search.on_edge.any()), first, last)
+    widened = bool((search.half_range > search.first_half_range).any())
+    return SurfaceMinimum(space.T @ search.q, search.least, iterations, converged,
+                          search.half_range, widened, bool(search.on_edge.any()), first, last)
 
 
 class _BoxSearch:
     """
     State of a search: the box around the best point so far, within a range about zero.
 
-    q, w : (n,) middle and half width of the box, in the coordinates of ``space``.   half_range :
-    (3,) half of the range of x.   least : criterion at the middle.   grid : (3^n, n) points of the
-    box, in half widths from its middle.
+    q, half_width : (n,) middle and half width of the box, in the coordinates of ``space``.
+    half_range : (3,) half of the range of x.   least : criterion at the middle.   grid : (3^n, n)
+    points of the box, in half widths from its middle.   values : (3^n,) criterion there.
     """
 
     def __init__(self, criterion: Callable[..., Any], space: Space, half_range: Floats,
                  width: Floats, x: Floats) -> None:
         self.criterion, self.space = criterion, space
         self.first_half_range = self.half_range = half_range
-        self.first_width = np.abs(space.q_of(width) if space.ratio_is_fixed else
-                                  np.array([width[:2].mean(), width[:2].sum(), width[2]]))
-        self.w = self.first_width
+        self.first_half_width = np.abs(
+            space.q_of(width) if space.ratio_is_fixed else
+            np.array([width[:2].mean(), width[:2].sum(), width[2]]))
+        self.half_width = self.first_half_width
         self.q = space.q_of(x)
         self.grid = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(self.q))))
         self.on_edge = np.zeros(len(self.q), bool)
@@ -144,7 +141,7 @@ class _BoxSearch:
 
     def surface(self) -> Surface:
         """Return the polynomial fitted to the criterion at 3^n points of the box."""
-        self.values = self.criterion((self.q + self.grid * self.w) @ self.space.T.T)
+        self.values = self.criterion((self.q + self.grid * self.half_width) @ self.space.T.T)
         self.least = float(self.values[len(self.grid) // 2])
         return fit_surface(self.grid, self.values)
 
@@ -152,8 +149,8 @@ class _BoxSearch:
         """Move to the surface's minimum in the range, shrink the box; return True if converged."""
         S, bound = self.space.S, self.space.bounds(self.half_range)
         v = S @ self.q
-        # y = (q - q0) / w; the range bounds v = S q, here in half ranges
-        to_y = np.linalg.inv(S) / self.w[:, None] * bound
+        # y = (q - q0) / half_width; the range bounds v = S q, here in half ranges: u
+        to_y = np.linalg.inv(S) / self.half_width[:, None] * bound
         low, high = -1.0 - v / bound, 1.0 - v / bound
         u = minimum_in_box(to_y.T @ surface.gradient, to_y.T @ surface.hessian @ to_y, low, high)
         self.on_edge = (u <= low) | (u >= high)
@@ -164,22 +161,24 @@ class _BoxSearch:
         # share of the criterion: the box is not shrunk if its curvature contributes less
         min_curvature = 1e-6
         shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < min_curvature * self.least)
-        narrow = 1e-3    # share of the first width, box of the last surface
-        converged = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
-        outside = np.abs(move) > self.w
+        narrow = 1e-3    # share of the first half width, box of the last surface
+        is_narrow = self.half_width <= narrow * self.first_half_width
+        converged = bool(small.all() and (~shrinks | is_narrow).all())
+        outside = np.abs(move) > self.half_width
         rounding = 1e-12    # share of the criterion by which equal values may differ
         if value_there <= self.least * (1 + rounding):
             self.q, self.least = self.q + move, value_there
         else:
             outside = self._to_best_of_grid(bound)
         grow, shrink = 2.0, 0.25
-        larger = np.minimum(grow * self.w, self.first_width)
-        self.w = np.where(outside, larger, np.where(shrinks, shrink * self.w, self.w))
+        larger = np.minimum(grow * self.half_width, self.first_half_width)
+        smaller = np.where(shrinks, shrink * self.half_width, self.half_width)
+        self.half_width = np.where(outside, larger, smaller)
         return converged
 
     def _to_best_of_grid(self, bound: Floats) -> Bools:
         """Move to the best grid point in the range; return True where it is an end of the box."""
-        points = self.q + self.grid * self.w
+        points = self.q + self.grid * self.half_width
         allowed = (np.abs(points @ self.space.S.T) <= bound).all(axis=1)
         k = int(np.argmin(np.where(allowed, self.values, np.inf)))
         if not allowed[k] or self.values[k] >= self.least:
@@ -192,13 +191,13 @@ class _BoxSearch:
         wider = self.space.widened(self.half_range, self.on_edge)
         if np.array_equal(wider, self.half_range):
             return False
-        self.half_range, self.w = wider, self.first_width
+        self.half_range, self.half_width = wider, self.first_half_width
         return True
 
 
 @dataclass(frozen=True, eq=False)
-class LeastSquares:
-    """Minimum of the criterion by least squares."""
+class SquaresMinimum:
+    """Minimum of the criterion, found by least squares."""
 
     x: Floats                # (3,) left, right (relative), heading (rad)
     value: float             # of the criterion there
@@ -219,22 +218,21 @@ class LeastSquares:
         return self.covariance / np.outer(self.sigma, self.sigma)
 
 
-def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False) -> LeastSquares:
+def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False) -> SquaresMinimum:
     """
     Return the parameters that minimise the (robust) mean square, by Gauss-Newton from x.
 
     leg : tracks and fixes.   x : (3,) first values: left, right (relative), heading (rad).
     space : free parameters.   robust : as in ``planar.score``.
     """
-    q = space.q_of(x)
-    iterations, converged = 0, False
+    q, iterations, converged = space.q_of(x), 0, False
     r, J = _linearise(leg, space.T @ q)
     value = _criterion(leg, r, robust)
     max_iterations = 200    # iterations; with reweighting a few are needed for each digit
     while not converged and iterations < max_iterations:
         iterations += 1
-        root = np.sqrt(np.tile(weights(_squared_distances(r), leg.sigma, robust), 2))
-        step = _solve(root[:, None] * (J @ space.T), -root * r)
+        root_weight = _root_weights(leg, r, robust)
+        step = _solve(root_weight[:, None] * (J @ space.T), -root_weight * r)
         for _ in range(HALVINGS):
             r_new, J_new = _linearise(leg, space.T @ (q + step))
             new_value = _criterion(leg, r_new, robust)
@@ -248,29 +246,33 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
         converged = bool(np.abs(step).max() < step_limit)
         q, r, J, value = q + step, r_new, J_new, new_value
     covariance, condition = _covariance(leg, r, J, space, robust)
-    # sigma of right minus left: by scatter, and by the bend of any track
-    by_heading = np.linalg.norm(J[:, 2])
-    by_difference = float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
-    by_bend = TRACK_BEND * by_heading / max(by_difference, 1e-12)
-    return LeastSquares(space.T @ q, value, iterations, converged, covariance, condition,
-                        float(np.sqrt(DIFFERENCE @ covariance @ DIFFERENCE + by_bend**2)))
+    # sigma of right minus left: from the scatter, and from the bend of any track
+    difference_effect = float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
+    bend_sigma = TRACK_BEND * np.linalg.norm(J[:, 2]) / max(difference_effect, 1e-12)
+    return SquaresMinimum(space.T @ q, value, iterations, converged, covariance, condition,
+                          float(np.sqrt(DIFFERENCE @ covariance @ DIFFERENCE + bend_sigma**2)))
 
 
 def _linearise(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
     """Return residuals rotated by -heading, (2k,) m, and their Jacobian by x: (2k, 3)."""
-    heading = x[2]
-    by_x = np.zeros((4, 5))
-    by_x[0] = coefficients(parameter_sets(leg, x))[0]
-    by_x[1, 0], by_x[2, 1] = leg.scale_left / 2, leg.scale_right / 2
-    by_x[3, 3:] = np.sin(heading), -np.cos(heading)
-    rows = np.hstack([by_x @ axis for axis in leg.basis])
+    # coefficients of ``PlanarLeg.basis``, and their derivatives by left, right and heading
+    c = np.zeros((4, 5))
+    c[0] = coefficients(parameter_sets(leg, x))[0]
+    c[1, 0], c[2, 1] = leg.scale_left / 2, leg.scale_right / 2
+    c[3, 3:] = np.sin(x[2]), -np.cos(x[2])
+    rows = np.hstack([c @ axis for axis in leg.basis])
     return rows[0], rows[1:].T
 
 
 def _squared_distances(r: Floats) -> Floats:
-    """Return squared distances of track and fixes, m^2, by residuals: (2k,) to (k,)."""
+    """Return squared distances of track and fixes, m^2, from residuals: (2k,) to (k,)."""
     east, north = r.reshape(2, -1)
     return east**2 + north**2
+
+
+def _root_weights(leg: PlanarLeg, r: Floats, robust: bool) -> Floats:
+    """Return the square roots of the weights of residuals r: (2k,)."""
+    return np.sqrt(np.tile(weights(_squared_distances(r), leg.sigma, robust), 2))
 
 
 def _criterion(leg: PlanarLeg, r: Floats, robust: bool) -> float:
@@ -279,21 +281,20 @@ def _criterion(leg: PlanarLeg, r: Floats, robust: bool) -> float:
 
 def _solve(A: Floats, b: Floats) -> Floats:
     """Return the least-squares solution, with columns scaled to equal size."""
-    size = np.linalg.norm(A, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    return np.linalg.lstsq(A / size, b, rcond=1e-14)[0] / size
+    norm = np.linalg.norm(A, axis=0)
+    norm = np.where(norm > 0, norm, 1.0)
+    return np.linalg.lstsq(A / norm, b, rcond=1e-14)[0] / norm
 
 
 def _covariance(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
                 robust: bool) -> tuple[Floats, float]:
     """Return the covariance of x, (3, 3), and the condition number of the Jacobian."""
-    w = np.tile(weights(_squared_distances(r), leg.sigma, robust), 2)
+    root_weight = _root_weights(leg, r, robust)
     s = np.linalg.svd(J @ space.T if space.ratio_is_fixed else J, compute_uv=False)
     condition = float(s[0] / s[-1]) if s[-1] > 1e-15 * s[0] else np.inf
-    root = np.sqrt(w)
-    _, s, vt = np.linalg.svd(root[:, None] * (J @ space.T), full_matrices=False)
+    _, s, vt = np.linalg.svd(root_weight[:, None] * (J @ space.T), full_matrices=False)
     s = np.maximum(s, 1e-15 * max(s[0], 1e-300))     # unobservable: a huge sigma
     freedom = max(len(r) - len(s), 1)
     to_x = space.T @ (vt.T / s)
-    rows = (root * r).reshape(2, -1)
+    rows = (root_weight * r).reshape(2, -1)
     return to_x @ to_x.T * ((rows**2).sum() / freedom * inflation(rows)), condition

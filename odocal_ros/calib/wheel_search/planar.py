@@ -4,13 +4,12 @@
 """
 Dead reckoning in the plane for many parameter sets at once (CN104359492A, steps 2 to 4).
 
-Criteria of a set are the distances at the fixes, whose maximum and mean the patent uses, and the
-heading relative to the course over ground. The refinement minimises the mean square.
-
 A parameter set is left scale, right scale (m per unit) and heading (rad, counter-clockwise), a
-rotation of the whole track. Positions are linear in the two scales, so the wheels' tracks are
-summed once, at one metre per unit, and a set costs two products of matrices. Horizontal components
-in n are used, without a map projection.
+rotation of the whole track. Its criteria are the distances between track and fixes, whose maximum
+and mean the patent uses, and the directions of the track relative to the course over ground. The
+refinement minimises the mean square of the distances. Positions are linear in the two scales, so
+the tracks of the wheels are summed once, at one metre per unit, and a set costs two products of
+matrices. Horizontal components in n are used, without a map projection.
 """
 
 from collections.abc import Iterator
@@ -50,7 +49,7 @@ class PlanarLeg:
     scale_right: float  # start value, m per unit
     # (k, 2) m, change of the lever arm since the start by turns
     lever_n: Floats = field(default_factory=lambda: np.zeros((1, 2)))
-    # (c, 2) first and last fix of the pieces with a course
+    # (c, 2) first and last fix of the pieces of the drive that have a course over ground
     pieces: Ints = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
     @property
@@ -112,7 +111,7 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
 
 
 def coefficients(sets: Floats) -> Floats:
-    """Return the coefficients of the rows of ``PlanarLeg.basis``, for (m, 3) sets: (m, 5)."""
+    """Return the coefficients of ``PlanarLeg.basis`` for parameter sets (m, 3): (m, 5)."""
     left, right, heading = np.asarray(sets, dtype=float).T
     return np.stack([left / 2, right / 2, np.ones_like(left), -np.cos(heading),
                      -np.sin(heading)], -1)

@@ -4,9 +4,9 @@
 """
 Search left scale, right scale and heading as in patent CN104359492A.
 
-An orthogonal array is followed by response surfaces; least squares check the result. Heading is
-here the counter-clockwise rotation of the dead-reckoned track: the error of the configured heading
-minus the yaw mounting angle. Positions cannot separate the two.
+The best row of an orthogonal array is refined by response surfaces; least squares check the
+result. Heading is here the counter-clockwise rotation of the dead-reckoned track: the error of the
+configured heading minus the yaw mounting angle. Positions cannot separate the two.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.wheel_search.minimisation import least_squares, LeastSquares, refine, Refined
+from odocal_ros.calib.wheel_search.minimisation import (
+    least_squares,
+    refine,
+    SquaresMinimum,
+    SurfaceMinimum,
+)
 from odocal_ros.calib.wheel_search.parameter_sets import (
     design_for,
     NAMES,
@@ -37,55 +42,57 @@ MAX_ROWS = 100      # judgement: of an array kept in calibration.json
 class SearchResult:
     """Result of the search; sets are left and right scale (m per unit), heading (rad)."""
 
-    start: tuple[float, float]  # scales before, m per unit
+    start: tuple[float, float]  # start values of the scales, m per unit
     ranges: Ranges
     array_name: str
-    sets: Floats                # of the array's rows
+    sets: Floats                # (n, 3) of the array's rows
     scores: Scores              # of these sets
     # row of the array with the smallest mean distance to the fixes (robust: smallest loss); ties:
     # smallest maximum distance
     best: int
     ratio_is_fixed: bool        # True: fixes do not separate left and right: ratio as in ``start``
-    refined: Refined            # by response surfaces
-    direct: LeastSquares        # by least squares
-    free: LeastSquares          # the same with left and right free
-    refined_set: Floats
-    direct_set: Floats
-    before: Scores              # of the start values, one row
-    after: Scores               # of the refined ones
+    surface_minimum: SurfaceMinimum
+    squares_minimum: SquaresMinimum    # by least squares
+    free_minimum: SquaresMinimum       # by least squares, ratio of left and right not fixed
+    surface_set: Floats         # (3,) at ``surface_minimum``: the result of the search
+    squares_set: Floats         # (3,) at ``squares_minimum``
+    start_scores: Scores        # of the start values, one row
+    surface_scores: Scores      # of ``surface_set``, one row
     reasons: tuple[Reason, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content for calibration.json, angles in deg."""
-        refined, direct = self.refined, self.direct
+        surface, squares, free = self.surface_minimum, self.squares_minimum, self.free_minimum
         ranges = [{'parameter': name, 'half': _in_degrees(name, half),
                    'at_the_end': _in_degrees(name, last_half),
                    'unit': 'deg' if name == 'heading' else '1', 'why': source}
                   for name, half, last_half, source in zip(
-                      NAMES, self.ranges.half_range, refined.half_range, self.ranges.sources,
+                      NAMES, self.ranges.half_range, surface.half_range, self.ranges.sources,
                       strict=True)]
-        shown = np.arange(len(self.sets))
-        if len(shown) > MAX_ROWS:      # the best ones, in the order of the array
-            shown = np.sort(np.argsort(self.scores.mean, kind='stable')[:MAX_ROWS])
+        row_numbers = np.arange(len(self.sets))
+        if len(row_numbers) > MAX_ROWS:      # the best ones, in the order of the array
+            row_numbers = np.sort(np.argsort(self.scores.mean, kind='stable')[:MAX_ROWS])
         return {
             'ranges': ranges,
             'array': {'name': self.array_name, 'rows': len(self.sets),
-                      'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
-            'best_row': _set(self.sets[self.best]) | self.scores.row(self.best),
+                      'shown': [_entry(self.sets[k]) | self.scores.row(k)
+                                for k in row_numbers.tolist()]},
+            'best_row': _entry(self.sets[self.best]) | self.scores.row(self.best),
             'left_and_right_held_together': self.ratio_is_fixed,
             'heading_means': HEADING_MEANS,
-            'response_surface': _set(self.refined_set) | {
-                'iterations': refined.iterations, 'settled': refined.converged,
-                'widened': refined.widened, 'on_edge': refined.on_edge} | {
-                f'{name}_{place}': getattr(surface, name) for name in ('r_squared', 'lack_of_fit')
-                for place, surface in (('first', refined.first), ('last', refined.last))},
-            'least_squares': _set(self.direct_set) | {
-                'iterations': direct.iterations, 'settled': direct.converged,
-                'formal_sigma': _set(direct.sigma * [*self.start, 1.0])},
-            'condition_number': _finite(self.free.condition),
-            'correlation': [[float(c) for c in row] for row in self.free.correlation],
-            'sigma_right_less_left': _finite(self.free.sigma_difference),
-            'before': self.before.row(0), 'after': self.after.row(0)}
+            'response_surface': _entry(self.surface_set) | {
+                'iterations': surface.iterations, 'settled': surface.converged,
+                'widened': surface.widened, 'on_edge': surface.on_edge} | {
+                f'{name}_{place}': getattr(polynomial, name)
+                for name in ('r_squared', 'lack_of_fit')
+                for place, polynomial in (('first', surface.first), ('last', surface.last))},
+            'least_squares': _entry(self.squares_set) | {
+                'iterations': squares.iterations, 'settled': squares.converged,
+                'formal_sigma': _entry(squares.sigma * [*self.start, 1.0])},
+            'condition_number': _finite(free.condition),
+            'correlation': [[float(c) for c in row] for row in free.correlation],
+            'sigma_right_less_left': _finite(free.sigma_difference),
+            'before': self.start_scores.row(0), 'after': self.surface_scores.row(0)}
 
 
 def _in_degrees(name: str, value: float) -> float:
@@ -94,11 +101,12 @@ def _in_degrees(name: str, value: float) -> float:
 
 
 def _finite(value: float) -> float | None:
+    """Return a number for JSON, None if it is infinite or NaN."""
     return float(value) if np.isfinite(value) else None
 
 
-def _set(parameters: Floats) -> dict[str, float]:
-    left, right, heading = (float(p) for p in parameters)
+def _entry(parameter_set: Floats) -> dict[str, float]:
+    left, right, heading = (float(p) for p in parameter_set)
     return {'scale_left': left, 'scale_right': right, 'heading_deg': float(np.rad2deg(heading))}
 
 
@@ -116,28 +124,30 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     sets = parameter_sets(leg, x)
     scores = score(leg, sets, robust)
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
-    free = direct = least_squares(leg, x[best], Space(ratio_is_fixed=False), robust)
+    free = squares = least_squares(leg, x[best], Space(ratio_is_fixed=False), robust)
     # half ranges are 2 sigma: the ratio is fixed if the fixes do not reduce its sigma
     ratio_is_fixed = not free.sigma_difference <= difference_limit(ranges)
     space = Space(ratio_is_fixed)
     if ratio_is_fixed:
-        direct = least_squares(leg, x[best], space, robust)
-    refined = _refine(leg, x[best], ranges, space, robust)
-    refined_set, direct_set = (parameter_sets(leg, fit.x)[0] for fit in (refined, direct))
-    refined_set[2], direct_set[2] = wrap(refined_set[2]), wrap(direct_set[2])
+        squares = least_squares(leg, x[best], space, robust)
+    surface = _refine(leg, x[best], ranges, space, robust)
+    surface_set, squares_set = (parameter_sets(leg, fit.x)[0] for fit in (surface, squares))
+    surface_set[2], squares_set[2] = wrap(surface_set[2]), wrap(squares_set[2])
+    reasons = [*([_not_separable(ranges, free)] if ratio_is_fixed else []),
+               *_convergence_reasons(ranges, surface, squares)]
     return SearchResult(
         (leg.scale_left, leg.scale_right), ranges, array_name, sets, scores, best,
-        ratio_is_fixed, refined, direct, free, refined_set, direct_set,
-        score(leg, leg.start, robust), score(leg, refined_set, robust),
-        _reasons(ranges, refined, direct, free, ratio_is_fixed))
+        ratio_is_fixed, surface, squares, free, surface_set, squares_set,
+        score(leg, leg.start, robust), score(leg, surface_set, robust), tuple(reasons))
 
 
 def difference_limit(ranges: Ranges) -> float:
-    """Return the largest relative sigma of right minus left with which they are separate."""
+    """Return the largest relative sigma of right minus left with which they are separable."""
     return float(np.hypot(*ranges.half_range[:2])) / 2
 
 
-def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
+def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space,
+            robust: bool) -> SurfaceMinimum:
     """Return the minimum of the mean square; if robust, from there that of Huber's mean."""
     # far from its minimum, Huber's mean is a cone, which a polynomial does not fit
     def criterion(robust: bool) -> Callable[..., Any]:
@@ -152,37 +162,40 @@ def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: boo
                    first=by_squares.first, iterations=by_squares.iterations + by_huber.iterations)
 
 
-def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: LeastSquares,
-             ratio_is_fixed: bool) -> tuple[Reason, ...]:
+def _not_separable(ranges: Ranges, free: SquaresMinimum) -> Reason:
+    """Return the reason that left and right scale cannot be separated."""
+    sigma = 100 * free.sigma_difference
+    sigma_text = f'{sigma:.2g} %' if sigma < 100 else '100 % or more'
+    return Reason(
+        Code.WHEELS_NOT_SEPARABLE, 'left and right scale cannot be separated: the sigma of '
+        f'their difference is {sigma_text} (limit {100 * difference_limit(ranges):.2g} %; '
+        f'condition number {free.condition:.2g}, correlation {free.correlation[0, 1]:+z.6f}). The '
+        'search changed both together')
+
+
+def _convergence_reasons(ranges: Ranges, surface: SurfaceMinimum,
+                         squares: SquaresMinimum) -> list[Reason]:
+    """Return the reasons if the search range was widened, or the search has not converged."""
     reasons = []
-    if ratio_is_fixed:
-        sigma = 100 * free.sigma_difference
-        text = f'{sigma:.2g} %' if sigma < 100 else '100 % or more'
-        reasons.append(Reason(
-            Code.WHEELS_NOT_SEPARABLE, 'left and right scale cannot be separated: the sigma of '
-            f'their difference is {text} (limit {100 * difference_limit(ranges):.2g} %; condition '
-            f'number {free.condition:.2g}, correlation {free.correlation[0, 1]:+z.6f}). The '
-            'search changed both together'))
-    if refined.widened:
+    if surface.widened:
         changes = [f'{name} ± {_amount(name, before)} to ± {_amount(name, after)}'
                    for name, before, after in zip(
-                       NAMES, ranges.half_range, refined.half_range, strict=True)
+                       NAMES, ranges.half_range, surface.half_range, strict=True)
                    if after > before]
         reasons.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
                               f'range, which was widened: {", ".join(changes)}'))
-    if not refined.converged or refined.on_edge:
-        text = 'ends on the edge of the widest range' if refined.on_edge else \
-            f'has not converged after {refined.iterations} response surfaces'
-        reasons.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {text}'))
-    else:
-        difference = np.abs(refined.x - direct.x)
-        difference[2] = abs(wrap(difference[2]))
-        share = float((difference / ranges.half_range).max())
-        max_share = 1e-3    # of the range
-        if share > max_share or not direct.converged:
-            reasons.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
-                                  f'differ by {100 * share:.2g} % of the range'))
-    return tuple(reasons)
+    if not surface.converged or surface.on_edge:
+        text = 'ends on the edge of the widest range' if surface.on_edge else \
+            f'has not converged after {surface.iterations} response surfaces'
+        return [*reasons, Reason(Code.SEARCH_NOT_SETTLED, f'the search {text}')]
+    difference = np.abs(surface.x - squares.x)
+    difference[2] = abs(wrap(difference[2]))
+    share = float((difference / ranges.half_range).max())
+    max_share = 1e-3    # of the range
+    if share > max_share or not squares.converged:
+        reasons.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
+                              f'differ by {100 * share:.2g} % of the range'))
+    return reasons
 
 
 def _amount(name: str, value: float) -> str:

@@ -19,7 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.wheel_search.minimisation import least_squares, LeastSquares, refine, Refined
+from odocal_ros.calib.wheel_search.minimisation import (
+    least_squares,
+    refine,
+    SquaresMinimum,
+    SurfaceMinimum,
+)
 from odocal_ros.calib.wheel_search.parameter_sets import (
     bose,
     full_factorial,
@@ -61,8 +66,8 @@ class Embodiment:
     orthogonal_rows: int         # fewest rows of an orthogonal array
     best_of_array: Row
     best_of_all: Row             # of the 441 combinations
-    response_surface: Refined    # refined optimum, within the range
-    least_squares: LeastSquares  # optimum without a range
+    response_surface: SurfaceMinimum    # optimum within the range
+    least_squares: SquaresMinimum       # optimum without a range
     radius: float                # m, nominal, of both wheels
     mean_distance: NDArray[np.float64]    # (7, 7) m by left and right radius, of the best heading
 

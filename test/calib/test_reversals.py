@@ -7,7 +7,7 @@
 import numpy as np
 import pytest
 
-from odocal_ros.calib.track_check import (
+from odocal_ros.calib.reversals import (
     CourseSections,
     cut_sections,
     find_reversed,
