@@ -34,11 +34,11 @@ from odocal_ros.reasons import Code, Reason
 SLIP_WINDOW = 4.0    # s, longer than a slip, shorter than a hill: judgement
 EXCESS_GRID = 0.2    # s between rows, a slip lasts longer: judgement
 SPAN = round(SLIP_WINDOW / EXCESS_GRID)    # definition: rows of a window
-END_STEPS = 2        # rows each side over which the speed at an end is averaged: judgement
+END_STEPS = 2        # rows each side of an end over which its speed is averaged: judgement
 # rad in a window: in larger turns the level error acts on another axis. Judgement
 MAX_WINDOW_TURN = 0.1
-# counts, possible rounding error of a window, 5 + 1 + 2: speed at an end wrong by 1 count in
-# 0.8 s, for 4 s; 1 at the ends of the window; margin: judgement
+# counts, possible rounding error of a window: 5, as the speed at an end may be wrong by 1 count in
+# 0.8 s, for 4 s; 1 at the ends of the window; 2, a margin: judgement
 WINDOW_ROUNDING_COUNTS = 8.0
 # m/s^2: a sliding wheel brakes the vehicle by at least this, even on ice (friction 0.1). Physical
 WEAKEST_BRAKING = 0.5
@@ -81,22 +81,21 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
                      min(track.t[-1] - TESTED_DELAYS[-1], t_imu[-1]), EXCESS_GRID)
     if len(grid) < 2 * SPAN:
         return Slips(np.empty(0), np.empty(0))
-    a = acceleration(grid, t_imu, f_b, track, f / K, latitude)
-    # in a turn the level error acts on another axis: such windows are excluded
-    C = track.C_nb_at(grid)
-    yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[END_STEPS:-END_STEPS]
-    turns = np.ptp(sliding_window_view(yaw, SPAN + 1), axis=1) > MAX_WINDOW_TURN
-    windows = _Windows(grid, a, turns, track, K, quantum)
+    C_nb = track.C_nb_at(grid)
+    yaw = np.unwrap(arctan2(C_nb[:, 1, 0], C_nb[:, 0, 0]))[END_STEPS:-END_STEPS]
+    has_turn = np.ptp(sliding_window_view(yaw, SPAN + 1), axis=1) > MAX_WINDOW_TURN
+    windows = _Windows(grid, acceleration(grid, t_imu, f_b, track, f / K, latitude), has_turn,
+                       track, K, quantum)
     # a mean of absolute values: slips hardly affect it
     delay = float(TESTED_DELAYS[np.argmin([np.abs(windows.excess(delay)).mean()
                                            for delay in TESTED_DELAYS])])
-    t, size = windows.events(delay)
-    looks_like_slip = len(windows.events(0.0)[0]) > len(t)
+    t, size = windows.slips(delay)
+    delay_looks_like_slip = len(windows.slips(0.0)[0]) > len(t)
     speed = K * np.diff(np.interp(grid + delay, track.t, track.s)) / EXCESS_GRID
     mean_speed = np.convolve(speed, np.full(5, 0.2), 'valid')      # over a second
     sign = [travel_error_sign(middle - SLIP_WINDOW / 2, SLIP_WINDOW, metres, grid[:-5], mean_speed)
             for middle, metres in zip(t, size, strict=True)]
-    return Slips(t, size, delay if looks_like_slip else 0.0, np.array(sign, int))
+    return Slips(t, size, delay if delay_looks_like_slip else 0.0, np.array(sign, int))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,31 +104,37 @@ class _Windows:
 
     grid: Floats         # (n,) s
     acceleration: Floats  # (n - 1,) m/s^2, forward, by the IMU
-    turns: Bools         # (m,) windows with turns, excluded
+    has_turn: Bools      # (m,) windows that are excluded: the level error acts on another axis
     track: Track
     K: float             # scale, m per scale unit
-    quantum: float       # of a count, scale units
+    quantum: float       # size of a count, scale units
 
     def excess(self, delay: float) -> Floats:
         """Return odometer minus IMU path in each window, at an odometer delay, s: (m,) m."""
         path = self.K * np.interp(self.grid + delay, self.track.t, self.track.s)
-        return np.where(self.turns, 0.0, excess_path(SPAN, self.acceleration, path))
+        return np.where(self.has_turn, 0.0, excess_path(SPAN, self.acceleration, path))
 
-    def events(self, delay: float) -> tuple[Floats, Floats]:
+    def slips(self, delay: float) -> tuple[Floats, Floats]:
         """Return time, s, and size, m, of each slip, at an odometer delay, s."""
         excess = self.excess(delay)
         # rough roads and soft suspensions cause a small excess everywhere: no slip
-        usual = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
+        noise = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
         min_size = 0.45    # m, 3 sigmas: tilt drift gives 0.1 m/s^2 in a window, 0.15 m
-        limit = max(min_size, WINDOW_ROUNDING_COUNTS * self.quantum * self.K, 6 * usual)
-        return _events(self.grid[END_STEPS:-SPAN - END_STEPS] + SLIP_WINDOW / 2, excess, limit)
+        limit = max(min_size, WINDOW_ROUNDING_COUNTS * self.quantum * self.K, 6 * noise)
+        middle = self.grid[END_STEPS:-SPAN - END_STEPS] + SLIP_WINDOW / 2
+        # adjacent windows with a slip are one group; the window in its middle has all of the slip
+        rows = np.flatnonzero(np.abs(excess) > limit)
+        groups = np.split(rows, np.flatnonzero(np.diff(middle[rows]) > SLIP_WINDOW / 2) + 1)
+        centres = [(group[0] + group[-1]) // 2 for group in groups if len(group)]
+        windows = np.array([centre for centre in centres if abs(excess[centre]) > limit], int)
+        return middle[windows], excess[windows]
 
 
 def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward: Floats,
                  latitude: float) -> Floats:
     """Return the mean acceleration along the forward axis from each grid time to the next."""
-    along = map_rows(lambda f_b: f_b @ forward, f_b)
-    force = np.diff(integral_at(grid, t_imu, along)) / EXCESS_GRID
+    forward_force = map_rows(lambda f_b: f_b @ forward, f_b)
+    force = np.diff(integral_at(grid, t_imu, forward_force)) / EXCESS_GRID
     rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
     return np.asarray(force - gravity(latitude, 0.0) * rise)
 
@@ -153,16 +158,6 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
     return difference[span:] - difference[:-span] - line_path
 
 
-def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:
-    """Return time and size of each slip from middle, s, and excess, m, of (m,) windows."""
-    # windows that contain a slip are one group; the window in its middle contains all of the slip
-    rows = np.flatnonzero(np.abs(excess) > limit)
-    groups = np.split(rows, np.flatnonzero(np.diff(middle[rows]) > SLIP_WINDOW / 2) + 1)
-    centres = [(group[0] + group[-1]) // 2 for group in groups if len(group)]
-    windows = np.array([centre for centre in centres if abs(excess[centre]) > limit], int)
-    return middle[windows], excess[windows]
-
-
 def travel_error_sign(t: float, duration: float, metres: float, t_speed: Floats,
                       speed: Floats) -> int:
     """
@@ -174,22 +169,21 @@ def travel_error_sign(t: float, duration: float, metres: float, t_speed: Floats,
     t, duration : begin and duration of the slip, s.   metres : wheel travel minus vehicle travel.
     t_speed, speed : (n,) s, m/s, of the vehicle, < 0 backwards.
     """
-    def near_slip(margin: float) -> tuple[Floats, Floats, float]:
-        """Return |speed|, its rate of change, and the sum of the signed speed, near the slip."""
-        first, last = np.searchsorted(t_speed, (t - margin, t + duration + margin + 1e-9))
-        size = np.abs(speed[first:last])
-        return size, np.diff(size) / np.diff(t_speed[first:last]), speed[first:last].sum()
+    def speeds(margin: float) -> tuple[Floats, Floats]:
+        """Return the speed, and the rate of its magnitude, from before to after the slip."""
+        rows = slice(*np.searchsorted(t_speed, (t - margin, t + duration + margin + 1e-9)))
+        return speed[rows], np.diff(np.abs(speed[rows])) / np.diff(t_speed[rows])
 
-    _, rate, direction = near_slip(BRAKE_SEARCH)
-    if metres * direction < 0:
+    v, rate = speeds(BRAKE_SEARCH)
+    if metres * v.sum() < 0:      # less travel in the direction of motion
         return -int(len(rate) and rate.min() > -WEAKEST_BRAKING)
-    size, rate, _ = near_slip(0.0)
-    stops = len(rate) and ((rate < -WEAKEST_BRAKING) | (size[1:] < MAX_STOP_SPEED)).all()
-    return int(stops and size.min() < MAX_STOP_SPEED)
+    v, rate = speeds(0.0)
+    brakes = len(rate) and ((rate < -WEAKEST_BRAKING) | (np.abs(v[1:]) < MAX_STOP_SPEED)).all()
+    return int(brakes and np.abs(v).min() < MAX_STOP_SPEED)
 
 
 def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
-    """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m; sign : their error sign."""
+    """Return TRAVEL_MISSING and TRAVEL_EXCESS of slips (k,), s, m, with their error signs."""
     reasons = []
     for code, tested_sign, verb, circumstance in (
             (Code.TRAVEL_MISSING, -1, 'misses', 'without braking'),
@@ -197,16 +191,20 @@ def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
         size, times = np.abs(metres[sign == tested_sign]), t[sign == tested_sign]
         several = len(times) > 1
         if len(times):
-            reasons.append(Reason(code, (
-                f'the odometer {verb} {size.sum():.2f} m of travel at {len(times)} '
-                f'place{"s" * several} ({circumstance}); {"largest " * several}'
-                f'at t = {times[np.argmax(size)]:.0f} s')))
+            reasons.append(Reason(
+                code, f'the odometer {verb} {size.sum():.2f} m of travel at {len(times)} '
+                f'place{"s" * several} ({circumstance}), {"the largest part " * several}'
+                f'at t = {times[np.argmax(size)]:.0f} s'))
     return reasons
 
 
 def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
-    """Return all slips, (k,) s, m, as one source of error, since wheels spin in one direction."""
-    # f : scale times forward axis.  gradient : of the parameters by displacement in n
+    """
+    Return all slips, (k,) s, m, as one source of error, since wheels spin in one direction.
+
+    f : (3,) scale times forward axis, in b.   gradient : (p, 3) of the parameters by displacement
+    in n.
+    """
     along_n = track.C_nb_at(t) @ f / np.linalg.norm(f) * np.abs(size)[:, None]
     return Source('wheel_slip', gradient @ along_n.sum(axis=0)[:, None])
 
@@ -237,8 +235,9 @@ class WheelSlips:
     end: Floats      # s
     size: Floats     # m, > 0: the wheel turned too far; unknown wheel: right minus left
     wheel: Ints      # -1 left, +1 right, 0 unknown
-    change: float = 0.0    # change of the ratio right / left, as one step at half the path
-    count: int = 2                   # number of wheels in the mean
+    # relative change of the ratio right / left, converted to one step at half the path
+    change: float = 0.0
+    count: int = 2         # number of wheels in the mean
 
     @property
     def t(self) -> Floats:
@@ -277,12 +276,12 @@ def wheel_slip_reason(slips: WheelSlips, names: tuple[str, ...]) -> tuple[Reason
     size, begin = slips.size[worst], slips.begin[worst]
     duration = max(slips.end[worst] - begin, SLIP_GRID)
     if slips.wheel[worst] == 0:
-        event = (f'one of the wheels slips: {100 * abs(size):.0f} cm between them that the gyro '
-                 'does not measure')
+        event = (f'one of the wheels slips: their paths differ by {100 * abs(size):.0f} cm that '
+                 'the gyro does not explain')
     else:
         event = (f'the {names[int(slips.wheel[worst] > 0)]} wheel '
                  f'{"spins" if size > 0 else "slides"}: {100 * abs(size):.0f} cm '
-                 f'{"more" if size > 0 else "less"} than gyro and other wheel give')
+                 f'{"more" if size > 0 else "less"} than the other wheel and the gyro give')
     others = f'; {n} such places, {np.abs(slips.size).sum():.2f} m in total' if n > 1 else ''
     return (Reason(Code.WHEEL_SLIP, f'{event}, from t = {begin:.1f} s for {duration:.1f} '
                    f's{others}'),)

@@ -27,7 +27,6 @@ SECTION_LENGTHS_M = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's bench
 SECTION_STARTS = 10     # definition: a section starts every tenth of the length, as in KITTI
 
 
-
 def track_residuals(path: Path, anchor: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.

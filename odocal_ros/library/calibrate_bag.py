@@ -179,7 +179,7 @@ def _calibrate_spans(bag: Recording, spans: list[tuple[int, int]],
             leg = bag.recorder.close(start_ns, stop_ns, bag.config.leg.preroll)
 
             def report(stage: Stage, prefix: str = prefix) -> None:
-                progress(None, prefix + stage.words())
+                progress(None, prefix + stage.as_text())
             parts = calibrate_parts(leg, bag.config, notes=notes[number - 1], holdout=holdout,
                                     progress=report)
             results += [replace(part, bag=bag.name) for part in parts]

@@ -94,7 +94,7 @@ def hint(view: SessionView) -> str:
     """Return the action: provide missing inputs, or the next step."""
     session, state = view.session, view.session.state
     if state is State.COMPUTING:
-        return f'computing: {view.stage.words() or "started"}; the result follows on ~/status'
+        return f'computing: {view.stage.as_text() or "started"}; the result follows on ~/status'
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.has_open_leg else 'call ~/reset')

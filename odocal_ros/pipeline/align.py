@@ -1,11 +1,16 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Alignment of a leg: choice of the standstill and of the heading source."""
+"""
+Alignment of a leg: level, gyro bias and heading at its start, with their sigmas.
+
+The level is estimated at a standstill before the start mark, otherwise over the first seconds of
+driving. The heading is from the first source that has one; the last source is the course by fixes.
+"""
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -40,6 +45,15 @@ Span = TypeVar('Span', Floats, tuple[float, float])      # begin and end, s
 HeadingOrRefusal = tuple[tuple[float, float] | None, str]
 
 
+class Heading(NamedTuple):
+    """Heading at the epoch of the level: the ENU yaw of the x axis of L, rad."""
+
+    yaw: float
+    sigma: float
+    source: str     # as the setting alignment.heading_source
+    shared: bool    # True: its error is the same in every leg (``Alignment.heading_shared``)
+
+
 def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
           config: Config) -> tuple[Alignment, tuple[Reason, ...]]:
     """Return the alignment of a leg, and reasons; spans: (k, 2) standstills, s."""
@@ -54,14 +68,13 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
                                      gyro_noise)
     reasons += _noise_reasons(noise.get('gyro', 0.0), nominal.grade_of(config.imu))
     level = replace(level, C_np=_enu_to_n_at(inputs, level.standstill, fixes_n, origin))
-    yaw, sigma, source, shared, refusals = _select_heading(inputs, level, origin.latitude, grade,
-                                                           config)
+    heading, refusals = _select_heading(inputs, level, origin.latitude, grade, config)
     reasons += refusals
-    if source == 'course':
-        yaw, sigma, refusals = _heading_by_course(inputs, level, metres_per_unit, fixes_n, origin,
-                                                  grade)
+    if heading is None:
+        heading, refusals = _heading_by_course(inputs, level, metres_per_unit, fixes_n, origin,
+                                               grade)
         reasons += refusals
-    return make_alignment(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
+    return make_alignment(level, *heading, origin, grade, gyro_noise), reasons
 
 
 def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
@@ -117,7 +130,7 @@ def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float,
     if rows.sum() < 2:      # the IMU ends at the mark, which IMU_GAP reports
         rows = np.abs(t - first) <= np.sort(np.abs(t - first))[1]
     _, q_0b = attitude(t[rows], inputs.w_b[rows], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    # mean speeds over 1 s at both ends, or the part of it in which the odometer has rows
+    # mean speeds over 1 s at both ends, or that part of the second in which the odometer has rows
     begin, end = (np.clip(t[rows][[0, -1]] + half, *inputs.travel.t[[0, -1]])
                   for half in (-0.5, 0.5))
     travel = (inputs.travel.at(end) - inputs.travel.at(begin)) * metres_per_unit
@@ -152,13 +165,8 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
 
 
 def _select_heading(inputs: Inputs, level: LevelAttitude, latitude: float, grade: nominal.Grade,
-                    config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
-    """
-    Return the heading by the first source that has one, and the reasons of those that do not.
-
-    The heading is the ENU yaw of L's x axis and its sigma, rad, the name of its source, and True
-    if its error is the same in every leg (``Alignment.heading_shared``).
-    """
+                    config: Config) -> tuple[Heading | None, tuple[Reason, ...]]:
+    """Return the heading from the first source that has one, and why the others have none."""
     setting = config.alignment.source
     order = [setting] if setting != 'auto' else [] if inputs.is_local else [
         'heading_topic', 'imu_orientation', 'gyrocompass']
@@ -166,16 +174,15 @@ def _select_heading(inputs: Inputs, level: LevelAttitude, latitude: float, grade
     for source in order if setting != 'course' else ():
         result, refusal = _heading_from_source(source, inputs, level, latitude, grade, config)
         if result is not None:
-            return *result, source, source != 'gyrocompass', ()
+            return Heading(*result, source, source != 'gyrocompass'), ()
         refusals.append(Reason(Code.GYROCOMPASS_REFUSED if source == 'gyrocompass'
                                else Code.HEADING_UNAVAILABLE, f'heading from {source}: {refusal}'))
-    # estimated by _heading_by_course
-    return 0.0, np.pi, 'course', True, tuple(refusals) if setting != 'auto' else ()
+    return None, tuple(refusals) if setting != 'auto' else ()
 
 
 def _heading_from_source(source: str, inputs: Inputs, level: LevelAttitude, latitude: float,
                          grade: nominal.Grade, config: Config) -> HeadingOrRefusal:
-    """Return yaw and sigma of the x axis of L by one source."""
+    """Return yaw and sigma of the x axis of L from one source."""
     if source == 'heading_topic':
         sent, t = inputs.external['heading']
         return _heading_from_orientations(t, sent.q_ni, sent.yaw_variance, np.eye(3), level,
@@ -189,7 +196,7 @@ def _heading_from_source(source: str, inputs: Inputs, level: LevelAttitude, lati
 
 
 def _configured_heading(inputs: Inputs, level: LevelAttitude, config: Config) -> HeadingOrRefusal:
-    """Return yaw and sigma at the level's epoch by ``alignment.heading``, which is at the mark."""
+    """Return yaw and sigma at the level's epoch from ``alignment.heading``, that at the mark."""
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
     mark_yaw = float(rotations.yaw_from_heading(config.alignment.heading))
@@ -219,16 +226,16 @@ def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Flo
     begin, end = level.standstill or (level.t - heading_reach, level.t + heading_reach)
     selected = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
     t, q, variance = t[selected], q[selected], variance[selected]
-    pick = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
-    if not level.standstill:
-        distance = np.where(pick, np.abs(t - level.t), np.inf)
-        pick = (distance <= heading_reach) & (distance == distance.min(initial=np.inf))
-    if not pick.any():
+    usable = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
+    if not level.standstill:      # only the nearest sample
+        distance = np.where(usable, np.abs(t - level.t), np.inf)
+        usable = (distance <= heading_reach) & (distance == distance.min(initial=np.inf))
+    if not usable.any():
         return None, 'no orientation at the start (covariance[0] = -1, or no message)'
-    C = rotations.matrix_from_quat(q[pick]) @ C_ib
-    yaw = np.arctan2(C[:, 1, 0].mean(), C[:, 0, 0].mean()) + offset
-    stated = float(np.median(variance[pick]))
-    sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
+    C_nb = rotations.matrix_from_quat(q[usable]) @ C_ib
+    yaw = np.arctan2(C_nb[:, 1, 0].mean(), C_nb[:, 0, 0].mean()) + offset
+    stated_variance = float(np.median(variance[usable]))
+    sigma = np.sqrt(stated_variance) if stated_variance > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
         return None, (f'its sigma is {np.rad2deg(sigma):.3g} deg; the limit is '
                       f'{np.rad2deg(HEADING_LIMIT):.3g} deg')
@@ -258,9 +265,10 @@ def _heading_by_gyrocompass(inputs: Inputs, level: LevelAttitude, latitude: floa
 
 def _heading_by_course(inputs: Inputs, level: LevelAttitude, metres_per_unit: float,
                        fixes_n: Floats, origin: Origin, grade: nominal.Grade,
-                       ) -> tuple[float, float, tuple[Reason, ...]]:
-    """Return the yaw that rotates the first 30 m of track onto the fixes, its sigma, reasons."""
-    trial = make_alignment(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)
+                       ) -> tuple[Heading, tuple[Reason, ...]]:
+    """Return the heading that rotates the first 30 m of track onto the fixes, and reasons."""
+    unknown = Heading(0.0, np.pi, 'course', True)
+    trial = make_alignment(level, *unknown, origin, grade, 0.0)
     course_time = 300.0    # s within which the path for a course must be driven
     rows = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + course_time)
     t, q_nb = attitude(inputs.t_imu[rows], inputs.w_b[rows] - trial.gyro_bias, trial.q_nb,
@@ -277,9 +285,10 @@ def _heading_by_course(inputs: Inputs, level: LevelAttitude, metres_per_unit: fl
         if (distance >= min_distance).any():
             k = int(np.argmax(distance >= min_distance))
             yaw = np.arctan2(*by_fixes[k, ::-1]) - np.arctan2(*dead_reckoned[k, ::-1])
-            return float(rotations.wrap(yaw)), float(np.sqrt(2) * sigma_fix / distance[k]), ()
+            sigma = float(np.sqrt(2) * sigma_fix / distance[k])
+            return unknown._replace(yaw=float(rotations.wrap(yaw)), sigma=sigma), ()
         cause = f'less than {min_distance:.0f} m from the start within {course_time:.0f} s'
     else:
         cause = f'fewer than 2 fixes within {course_time:.0f} s of the start'
-    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, f'no course over ground: {cause}',
-                               'Drive straight on right after the start mark, under open sky.'),)
+    return unknown, (Reason(Code.HEADING_UNAVAILABLE, f'no course over ground: {cause}',
+                            'Drive straight on right after the start mark, under open sky.'),)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 import math
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, TYRE_SPREAD
 from odocal_ros.settings.nominal import nominal_scale
 
 MOUNTING_PLAY = 0.087    # rad, 5 deg, judgement: mountings of one vehicle bend less
+MAX_OVERLAP = 0.1        # judgement: share of a leg's time that is also in an earlier leg
 # reasons of a single leg that do not hold for several
 SINGLE_LEG_CODES = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE,
                     Code.SCALE_FAR_FROM_NOMINAL}
@@ -56,13 +58,13 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     used = usable or legs
     method_names = dict.fromkeys(name for leg in used for name in leg.methods)
     carried = carried if carried and _precedes(carried, used) else None
-    # the IMU constants must be by other legs than these
+    # the IMU constants must be from other legs than these
     earlier = carried or (imu if imu and not any(
         imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
     methods = {name: _combine_method(name, [
-        (leg.methods[name], leg.drive_start_ns, i) for i, leg in enumerate(legs, 1)
-        if leg in used and name in leg.methods], config, earlier, has_local_positions(used))
-        for name in method_names}
+        _LegMethod(leg.methods[name], leg.drive_start_ns, number)
+        for number, leg in enumerate(legs, 1) if leg in used and name in leg.methods],
+        config, earlier, has_local_positions(used)) for name in method_names}
     with_marginal = {name for leg in used for name, method in leg.methods.items()
                      if method.marginal}
     estimates, estimating_methods = choose(methods, config.method)
@@ -98,7 +100,7 @@ def _join_reasons(reasons: Sequence[Reason], further: Sequence[Reason]) -> list[
 
 
 def _precedes(carried: CarriedInformation, legs: Sequence[LegResult]) -> bool:
-    """Return True if information is of legs before these, in the same unit of the scale."""
+    """Return True if the information is from earlier legs, in the same unit of the scale."""
     return carried.last_ns < min(leg.start_ns for leg in legs) and all(
         leg.methods[SMOOTHER].estimates['scale_factor'].unit == carried.unit
         for leg in legs if SMOOTHER in leg.methods)
@@ -106,7 +108,7 @@ def _precedes(carried: CarriedInformation, legs: Sequence[LegResult]) -> bool:
 
 def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Sequence[LegResult],
                                 carried: CarriedInformation | None) -> CarriedInformation | None:
-    """Return the information of earlier and these legs for later ones, None without any."""
+    """Return the information of earlier legs and these for later ones, None without any."""
     combined = methods.get(SMOOTHER)
     times = [leg.start_ns for leg in usable if SMOOTHER in leg.methods
              and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
@@ -118,14 +120,13 @@ def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Seq
 
 
 def overlapping_legs(legs: Sequence[LegResult]) -> list[LegResult]:
-    """Return legs that share over a tenth of their time with an earlier one: not independent."""
-    max_share = 0.1    # of the time of a leg
+    """Return the legs that overlap an earlier one by more than MAX_OVERLAP: not independent."""
     independent: list[LegResult] = []
     overlapping: list[LegResult] = []
     for leg in legs:
         shared_ns = [min(leg.stop_ns, earlier.stop_ns) - max(leg.start_ns, earlier.start_ns)
                      for earlier in independent]
-        is_overlapping = any(ns > max_share * (leg.stop_ns - leg.start_ns) for ns in shared_ns)
+        is_overlapping = any(ns > MAX_OVERLAP * (leg.stop_ns - leg.start_ns) for ns in shared_ns)
         (overlapping if is_overlapping else independent).append(leg)
     return overlapping
 
@@ -134,7 +135,12 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
                     config: Config, numbers: Sequence[int] | None = None,
                     carried: CarriedInformation | None = None,
                     local: bool = False) -> MethodResult:
-    """Return the result of a method for several legs by time, and carried ones if possible."""
+    """
+    Return the result of a method for several legs, combined with earlier ones if possible.
+
+    times_ns : start of the drive of each leg.   numbers : of the legs, for texts; by default from
+    1.   carried : information of earlier legs.   local : positions are in a local frame.
+    """
     if carried and all(result.marginal for result in results):
         unknown = {parameter: Estimate(None, None, estimate.unit)
                    for parameter, estimate in results[0].estimates.items()}
@@ -149,17 +155,19 @@ def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequen
     return combine_method(name, results, drift_variances)
 
 
-def _combine_method(name: str, leg_results: Sequence[tuple[MethodResult, int, int]],
-                    config: Config, carried: CarriedInformation | None,
-                    local: bool) -> MethodResult:
-    """
-    Return the combination of results that are not rejected, or of all if all are rejected.
+class _LegMethod(NamedTuple):
+    """The result of a method on one leg."""
 
-    leg_results : result, start time, ns, and number of each leg.
-    """
-    usable = [(result, time_ns, number) for result, time_ns, number in leg_results
-              if result.verdict is not Verdict.REJECTED]
-    results, times_ns, numbers = zip(*(usable or leg_results), strict=True)
+    result: MethodResult
+    start_ns: int    # of the drive of the leg
+    number: int      # of the leg, from 1
+
+
+def _combine_method(name: str, legs: Sequence[_LegMethod], config: Config,
+                    carried: CarriedInformation | None, local: bool) -> MethodResult:
+    """Return the combination of results that are not rejected, or of all if all are rejected."""
+    usable = [leg for leg in legs if leg.result.verdict is not Verdict.REJECTED]
+    results, times_ns, numbers = zip(*(usable or legs), strict=True)
     combined = combine_results(name, list(results), times_ns, config, numbers,
                                carried if usable else None, local)
     if usable or len(results) == 1:
@@ -188,7 +196,9 @@ def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
             if is_single or reason.code not in SINGLE_LEG_CODES
             and not (method.marginal and reason.code in COMBINED_CODES))]
         if leg in overlapping:
-            reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}overlaps an earlier leg; not used'))
+            reasons.append(Reason(
+                Code.LEGS_OVERLAP, f'{prefix}overlaps an earlier leg by more than '
+                f'{100 * MAX_OVERLAP:.0f} % of its duration; not used'))
         elif usable and leg not in usable:
             all_reasons = [*leg.reasons, *(reason for method in leg.methods.values()
                                            for reason in _additional_reasons(method, leg))]
@@ -245,7 +255,7 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
         differences.append(f'the scale of leg {high.leg} is {100 * excess:.1f} % above '
                            f'that of leg {low.leg} (limit {100 * TYRE_SPREAD:.0f} %)')
     yaws = _values_by_leg('yaw_mounting_angle', estimates)
-    # of a reversed IMU they are near +-180 deg
+    # within half a turn of the first: those of a reversed IMU are near +-180 deg
     extremes = _significant_extremes([yaw._replace(value=float(wrap(yaw.value - yaws[0].value)))
                                       for yaw in yaws])
     if extremes and (excess := extremes[1].value - extremes[0].value) > MOUNTING_PLAY:
@@ -260,7 +270,7 @@ def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason
 class _LegValue(NamedTuple):
     """The estimate of one value by one leg."""
 
-    leg: int    # its number
+    leg: int    # number of the leg, from 1
     value: float
     sigma: float
     unit: str
@@ -269,14 +279,15 @@ class _LegValue(NamedTuple):
 def _values_by_leg(name: str,
                    estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> list[_LegValue]:
     """Return the estimates of a value by the legs that determine it."""
-    return [_LegValue(leg, e.value, e.sigma, e.unit) for leg, of_leg in estimates
-            if (e := of_leg.get(name)) is not None and e.value is not None and e.sigma is not None]
+    return [_LegValue(number, e.value, e.sigma, e.unit) for number, leg_values in estimates
+            if (e := leg_values.get(name)) is not None and e.value is not None
+            and e.sigma is not None]
 
 
 def _significant_extremes(values: list[_LegValue]) -> tuple[_LegValue, _LegValue] | None:
     """Return the lowest and the highest value if they differ significantly."""
     if len(values) < 2:
         return None
-    low, *_, high = sorted(values, key=lambda one: one.value)
-    sigma = (high.sigma**2 + low.sigma**2)**0.5
+    low, *_, high = sorted(values, key=attrgetter('value'))
+    sigma = math.hypot(high.sigma, low.sigma)
     return (low, high) if high.value - low.value > FAULT_SIGMAS * sigma else None

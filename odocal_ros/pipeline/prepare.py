@@ -87,9 +87,10 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFix
     end_reasons = tuple(r for r in drive_reasons if r.code is Code.LEG_NOT_STRAIGHT)
     return PreparedLeg(
         **vars(located), leg=leg, inputs=inputs, config=config, imu_orientation=orientation,
-        lever_v=np.subtract(config.gnss.lever_arm, config.odometer.lever_arm), spans=spans,
-        alignment=alignment, alignment_reasons=alignment_reasons, epochs=epochs, track=track,
-        wheel_slips=wheel_slips, metres_per_unit=located.rough_scale, distance=distance,
+        lever_v=np.subtract(config.gnss.lever_arm, config.odometer.lever_arm),
+        standstills=spans, alignment=alignment, alignment_reasons=alignment_reasons, epochs=epochs,
+        track=track, wheel_slips=wheel_slips, metres_per_unit=located.rough_scale,
+        distance=distance,
         t_fit=_time_of_four_fifths(track, inputs.t_stop) if holdout else inputs.t_stop,
         holdout=holdout,
         reasons=(*reasons, *gap_reasons, *coarse_reasons(inputs, located), *wheel_reasons,

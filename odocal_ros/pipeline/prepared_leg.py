@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A leg prepared for the methods, and what is common to them.
+Input and output of the calibration methods, and the comparison of their tracks with the fixes.
 
-``PreparedLeg`` is the input of each method, ``MethodRun`` its output. The rest compares the tracks
-before and after calibration with the fixes.
+``PreparedLeg`` is the input of each method, ``MethodRun`` its output. ``track_results`` compares
+the dead-reckoned tracks before and after calibration with the fixes.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import nan
@@ -34,14 +34,14 @@ from odocal_ros.screening.imu_orientation import ImuOrientation
 from odocal_ros.screening.inputs import Inputs, LocatedFixes
 from odocal_ros.settings.config import Config
 
-# called with the number of passes, and Stage.change
+# called after each pass of a fit with the number of passes so far, and ``Stage.change``
 PassCallback = Callable[[int, float], None]
-SHOWN_WITHOUT_DECIMALS = 10.0     # judgement: sigmas, from which on a change is
-MIN_TRACK_FIXES = 3    # judgement: for a check of the track
+SHOWN_WITHOUT_DECIMALS = 10.0     # judgement: sigmas, for changes of this size or larger
+MIN_TRACK_FIXES = 3    # judgement: least number of fixes for a check of the track
 
 
 class Paths(NamedTuple):
-    """The path with configured and with calibrated values; undetermined angles are the same."""
+    """The path as configured and as calibrated; undetermined angles are equal in both."""
 
     before: Path
     after: Path
@@ -55,8 +55,7 @@ class MethodRun(NamedTuple):
     data_reasons: tuple[Reason, ...] = ()     # on the data, independent of the method
     # 'gnss' or 'odometer' to delay, s, and sigma; None from a method that estimates none
     delays: dict[str, tuple[float, float]] | None = None
-    # on slip or delay of the odometer relative to the IMU, used unless a better method has
-    # checked; None: not checked
+    # on slip or delay of the odometer relative to the IMU; None: not checked
     odometer_reasons: tuple[Reason, ...] | None = None
 
 
@@ -65,11 +64,11 @@ class Stage:
     """A stage of the work on a leg."""
 
     name: str = ''         # the running method, or 'tracks'; empty before the first
-    done: float = 0.0      # share of the work in the stages before; a fit cannot be predicted
+    done: float = 0.0      # share of the work in earlier stages; that of a fit is unknown
     passes: int = 0        # passes of its fit so far
-    change: float = nan    # largest one of a constant in the last pass, sigmas; NaN: none yet
+    change: float = nan    # sigmas, largest change of a constant in the last pass; NaN: none yet
 
-    def words(self) -> str:
+    def as_text(self) -> str:
         """Return the stage as text."""
         if not self.passes:
             return self.name
@@ -87,7 +86,7 @@ class PreparedLeg(LocatedFixes):
     config: Config
     imu_orientation: ImuOrientation | None    # None: not determined
     lever_v: NDArray[np.float64]         # (3,) m, from the odometer's point to the antenna
-    spans: NDArray[np.float64]           # (s, 2) s, standstills
+    standstills: NDArray[np.float64]     # (s, 2) s, begin and end
     alignment: Alignment
     alignment_reasons: tuple[Reason, ...]
     epochs: tuple[Floats, Floats]        # attitude after alignment, t (m,) s and q_nb (m, 4)
@@ -98,17 +97,17 @@ class PreparedLeg(LocatedFixes):
     t_fit: float                         # s; if ``holdout``, later fixes are held out
     holdout: bool
     reasons: tuple[Reason, ...]          # of the leg
-    end_reasons: tuple[Reason, ...]      # those that only concern methods by its ends
+    end_reasons: tuple[Reason, ...]      # only for methods that use its end points alone
 
     def path(self, f: Floats, track: dead_reckoning.Track | None = None) -> Path:
         """Return the path of the antenna for f, (3,) scale times forward axis in b."""
         track = self.track if track is None else track
         lever_b = dead_reckoning.axes_from_forward(f) @ self.lever_v
 
-        def at(t: Floats) -> Floats:
+        def path_at(t: Floats) -> Floats:
             path = track.at(t) @ f
             return path + track.C_nb_at(t) @ lever_b if np.any(lever_b) else path
-        return at
+        return path_at
 
     def level_path(self, t: Floats) -> Floats:
         """Return travel along the gyro's heading on level ground, up to a rotation: (n, 2)."""
@@ -136,29 +135,29 @@ class PreparedLeg(LocatedFixes):
 
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
         """Return the antenna's position at t by fixes or surveyed mark, None without either."""
-        point = self._surveyed(name, t)
+        point, span = self._surveyed_point(name, t), standing_at(t, self.standstills)
         if point:
-            position = np.array([np.deg2rad(point[0]), np.deg2rad(point[1]), point[2]])
-            return MarkFix(t, self.origin.to_n(position), np.eye(3) * point[3]**2,
-                           standing_at(t, self.spans) is not None, 0, surveyed=True)
+            latitude, longitude, height, sigma = point      # deg, deg, m, m
+            position = np.array([np.deg2rad(latitude), np.deg2rad(longitude), height])
+            return MarkFix(t, self.origin.to_n(position), np.eye(3) * sigma**2, span is not None,
+                           0, surveyed=True)
         inputs, at_mark_n = self.inputs, path(np.array(t))
         interval = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
-        return fix_at(t, standing_at(t, self.spans),
-                      (inputs.t_fix, self.fixes_n, inputs.covariance_n),
+        return fix_at(t, span, (inputs.t_fix, self.fixes_n, inputs.covariance_n),
                       lambda times: path(times) - at_mark_n,
                       self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * interval))
 
-    def _surveyed(self, name: str, t: float) -> tuple[float, ...]:
-        """Return the reference point at a mark, () if the path does not start or end there."""
+    def _surveyed_point(self, name: str, t: float) -> tuple[float, ...]:
+        """Return the setting reference.start or .end; () if it does not apply at t."""
         if not name or self.origin.is_local:      # surveyed points are geodetic
             return ()
         t_mark = 0.0 if name == 'start' else self.inputs.t_stop
-        span = standing_at(t_mark, self.spans)
+        span = standing_at(t_mark, self.standstills)
         at_mark = 0.05    # s, largest distance from a mark for its surveyed point
-        if abs(t - t_mark) <= at_mark or (span and span == standing_at(t, self.spans)):
-            point: tuple[float, ...] = getattr(self.config.reference, name)
-            return point
-        return ()
+        is_there = abs(t - t_mark) <= at_mark or (
+            span and span == standing_at(t, self.standstills))
+        point: tuple[float, ...] = getattr(self.config.reference, name)
+        return point if is_there else ()
 
 
 def attitude_of(inputs: Inputs, origin: dead_reckoning.Origin, t_begin: float, q_nb: Floats,
@@ -189,19 +188,23 @@ def configured_forward(prepared: PreparedLeg, f: Floats,
 
 
 def without_outliers(prepared: PreparedLeg, path: Path, anchor: MarkFix,
-                     between: Bools) -> tuple[Bools, tuple[Reason, ...]]:
-    """Return a mask of fixes, (k,), without gross outliers from a fitted path, and reasons."""
-    if not between.any():
-        return between, ()
+                     selected: Bools) -> tuple[Bools, tuple[Reason, ...]]:
+    """
+    Return a mask of fixes that are no gross outliers from a fitted path, (k,), and reasons.
+
+    anchor : mark whose position the path is set to.   selected : (k,) fixes to test and report.
+    """
+    if not selected.any():
+        return selected, ()
     fixes = prepared.inputs.t_fix, prepared.fixes_n
     residuals = track_check.track_residuals(path, anchor, fixes)
     distances = np.hypot(*residuals[:, :2].T)
     # 20 times the usual distance from the track: a certain outlier
-    limit_m = 20.0 * max(float(np.median(distances[between])), prepared.fix_sigma)
+    limit_m = 20.0 * max(float(np.median(distances[selected])), prepared.fix_sigma)
     is_outlier = distances > limit_m
-    count = int((is_outlier & between).sum())
+    count = int((is_outlier & selected).sum())
     return ~is_outlier, (Reason(
-        Code.BAD_ROWS_DROPPED, f'{count} of {int(between.sum())} fixes are more than '
+        Code.BAD_ROWS_DROPPED, f'{count} of {int(selected.sum())} fixes are more than '
         f'{limit_m:.0f} m from the track; not used in the check',
         'Check the receiver and its sky view, or the localisation.'),) * bool(count)
 
@@ -220,22 +223,20 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     if not prepared.origin.is_local:       # else the position on the Earth is unknown
         fields |= {'origin': (prepared.origin.latitude, prepared.origin.longitude,
                               prepared.origin.height)}
-    anchor, between, path_length, section_reasons = _compared_section(prepared, after, start)
-    fields['reference_n'] = prepared.fixes_n[between]
-    if anchor is None or between.sum() < MIN_TRACK_FIXES:
-        return fields, section_reasons
-    fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    residual_before, residual_after = (
-        track_check.track_residuals(path, anchor, fixes) for path in paths)
-    fields |= {'before': track_check.track_statistics(residual_before, path_length),
-               'after': track_check.track_statistics(residual_after, path_length)}
-    errors = np.interp(fixes[0], *path_length_over_time(prepared)), residual_before, residual_after
+    section = _compare(prepared, paths, start)
+    fields['reference_n'] = prepared.fixes_n[section.used]
+    if not section.residuals:
+        return fields, section.reasons
+    for name, residuals in zip(('before', 'after'), section.residuals, strict=True):
+        fields[name] = track_check.track_statistics(residuals, section.path_length)
+    path_lengths = np.interp(prepared.inputs.t_fix[section.used], *path_length_over_time(prepared))
+    errors = path_lengths, section.residuals[0], section.residuals[1]
     fields['per_distance'] = track_check.errors_per_distance(*errors)
-    kept, outlier_reasons = without_outliers(prepared, after, start, between)
+    kept, outlier_reasons = without_outliers(prepared, after, start, section.used)
     evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
                              start, paths, prepared.config, prepared.t_fit, prepared.time_span)
     return fields | {'evidence': evidence}, (
-        *section_reasons, *track_check.worse_check_reasons(*errors, bool(prepared.nominal_scale)),
+        *section.reasons, *track_check.worse_check_reasons(*errors, bool(prepared.nominal_scale)),
         *outlier_reasons, *counter_change_reasons(evidence.sections, evidence.t_fix,
                                                   evidence.fix_distance))
 
@@ -245,51 +246,55 @@ def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple
     start = prepared.mark(prepared.time_span[0], path, 'start')
     if start is None:
         return {}, ()
-    anchor, between, path_length, reasons = _compared_section(prepared, path, start)
-    if anchor is None or between.sum() < MIN_TRACK_FIXES:
-        return {}, reasons
-    fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
-    residuals = track_check.track_residuals(path, anchor, fixes)
-    return {'check': asdict(track_check.track_statistics(residuals, path_length))}, reasons
+    section = _compare(prepared, [path], start)
+    checks = [asdict(track_check.track_statistics(residuals, section.path_length))
+              for residuals in section.residuals]
+    return {'check': checks[0]} if checks else {}, section.reasons
 
 
-def _compared_section(prepared: PreparedLeg, path: Path,
-                      start: MarkFix) -> tuple[MarkFix | None, Bools, float, tuple[Reason, ...]]:
-    """
-    Return the section in which a path is compared with the fixes.
+class Comparison(NamedTuple):
+    """Comparison of paths with the fixes of the leg, or of its part that the fit does not use."""
 
-    That is: the anchor, the mark at which both are equal; a mask of the fixes; the path length,
-    m; and reasons.
-    """
+    used: Bools                # (k,) fixes that are compared
+    residuals: list[Floats]    # (n, 3) m of each path, minus fixes; empty with too few fixes
+    path_length: float         # m
+    reasons: tuple[Reason, ...]
+
+
+def _compare(prepared: PreparedLeg, paths: Sequence[Path], start: MarkFix) -> Comparison:
+    """Return the comparison of paths; the last one has the position of ``start`` there."""
     anchor: MarkFix | None = start
     begin, end = start.t, prepared.t_fit
     reasons: tuple[Reason, ...] = ()
     if prepared.holdout:
-        anchor = prepared.mark(prepared.t_fit, path)
+        anchor = prepared.mark(prepared.t_fit, paths[-1])
         begin, end = prepared.t_fit, prepared.inputs.t_stop
     end = min(end, prepared.time_span[1])
-    between = (prepared.inputs.t_fix >= begin) & (prepared.inputs.t_fix <= end)
+    used = (prepared.inputs.t_fix >= begin) & (prepared.inputs.t_fix <= end)
+    residuals = []
     if anchor is not None:
-        inside, reasons = without_outliers(prepared, path, anchor, between)
-        between &= inside
-    a, b = np.interp([begin, end], *path_length_over_time(prepared))
-    return anchor, between, b - a, reasons
+        inside, reasons = without_outliers(prepared, paths[-1], anchor, used)
+        used &= inside
+        fixes = prepared.inputs.t_fix[used], prepared.fixes_n[used]
+        residuals = [track_check.track_residuals(path, anchor, fixes) for path in paths] \
+            if used.sum() >= MIN_TRACK_FIXES else []
+    begin_m, end_m = np.interp([begin, end], *path_length_over_time(prepared))
+    return Comparison(used, residuals, end_m - begin_m, reasons)
 
 
 def path_length_over_time(prepared: PreparedLeg) -> tuple[Floats, Floats]:
-    """Return times of the track, s, and the path length up to them, m."""
+    """Return times of the track, s, and path length up to them, m."""
     path_length = running_sum(np.abs(np.diff(prepared.track.s)))
     return prepared.track.t, path_length * prepared.metres_per_unit
 
 
 def slip_check(prepared: PreparedLeg, track: dead_reckoning.Track, f: Floats,
-               between: tuple[float, float]) -> Slips:
-    """Return the slips of the mean wheel between two times, s, except those of one wheel."""
+               interval: tuple[float, float]) -> Slips:
+    """Return the slips of the mean wheel in an interval, s, without those of one wheel."""
     if not prepared.inputs.has_accelerometer:
         return Slips(np.empty(0), np.empty(0))
     slips = find_slips(prepared.inputs.t_imu, prepared.inputs.f_b, track, f,
                        prepared.origin.latitude, count_size(prepared.inputs.travel))
-    of_one_wheel = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SLIP_WINDOW).any(axis=1)
-    kept = (slips.t >= between[0]) & (slips.t <= between[1]) & ~of_one_wheel
-    return slips._replace(t=slips.t[kept], size=slips.size[kept],
-                          travel_error_sign=slips.travel_error_sign[kept])
+    is_single_wheel = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SLIP_WINDOW).any(axis=1)
+    kept = (slips.t >= interval[0]) & (slips.t <= interval[1]) & ~is_single_wheel
+    return Slips(slips.t[kept], slips.size[kept], slips.delay, slips.travel_error_sign[kept])

@@ -36,7 +36,7 @@ from odocal_ros.settings.config import Config
 def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     """Run the smoother on a leg; the times of its paths are stamps of the fixes."""
     leg = make_smoother_leg(prepared.inputs, prepared.config, prepared.origin, prepared.fixes_n,
-                            prepared.spans, prepared.rough_scale, prepared.t_fit)
+                            prepared.standstills, prepared.rough_scale, prepared.t_fit)
     t_slip, metres = prepared.wheel_slips.uncertain_travel()
     leg = replace(leg, uncertain_t=np.append(leg.uncertain_t, t_slip),
                   uncertain_sigma=np.append(leg.uncertain_sigma, metres / prepared.rough_scale))

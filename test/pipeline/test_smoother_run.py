@@ -134,7 +134,7 @@ def test_a_start_within_an_odometer_gap_is_not_slip(made):
     (Stage('smoother', 0.1, 1, 51234.5), 'smoother, 1 pass done, remaining change 51234 sigma'),
     (Stage('smoother', 0.1, 7, 0.4249), 'smoother, 7 passes done, remaining change 0.42 sigma')])
 def test_progress_states_passes_and_change_and_no_percentage(stage, words):
-    assert stage.words() == words
+    assert stage.as_text() == words
 
 
 def test_auto_uses_the_smoother_and_computes_two_point_too(made):
