@@ -41,27 +41,33 @@ class Columns(NamedTuple):
         return Columns(self.time_ns[rows], self.channel[rows], self.raws.take(rows))
 
 
-ChunkBlock = list[Chunk | Damaged]      # chunks; the damage of those not readable
-ReadChunks = Callable[[Sequence[ChunkIndex]], ChunkBlock]     # reads adjacent chunks
+ReadChunk = Callable[[ChunkIndex], Chunk]     # or raises Damaged
 ScanChunk = Callable[[Chunk], Sequence[Entry]]     # or raises Damaged
 ReportDamage = Callable[[Damaged], None]
 
 
 def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
-            known_channels: Collection[int], read_chunks: ReadChunks, scan: ScanChunk,
+            known_channels: Collection[int], read_chunk: ReadChunk, scan: ScanChunk,
             report_damage: ReportDamage) -> Iterator[Batch]:
     """
     Yield the messages of some channels by time, many at a time.
 
     index : chunks in order of their stated times.   known_channels : all channels of the file.
-    scan : returns the messages of a chunk one by one.   report_damage : called with each damage.
+    scan : returns the messages of a chunk, read one by one.   report_damage : called with each
+    damage.
     """
     is_requested, is_known = _channel_mask(channels), _channel_mask(known_channels)
     later: Columns | None = None         # messages that may be later than those of the next chunk
     next_chunk, min_bytes = 0, 1      # the first block is one chunk, which is often sufficient
     while next_chunk < len(index):
-        block, next_chunk = _read_block(index, next_chunk, min_bytes, read_chunks)
-        columns = _columns(block, is_known, scan, report_damage)
+        first_chunk, next_chunk = next_chunk, _block_end(index, next_chunk, min_bytes)
+        chunks = []
+        for entry in index[first_chunk:next_chunk]:
+            try:
+                chunks.append(read_chunk(entry))
+            except Damaged as error:
+                report_damage(error)
+        columns = _columns(chunks, is_known, scan, report_damage)
         if len(channels) < len(known_channels):
             columns = columns.take(is_requested[columns.channel])
         columns = _join(later, columns) if later else columns
@@ -76,46 +82,36 @@ def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
         min_bytes = BLOCK_BYTES + int(later.raws.size.sum() if later else 0)
 
 
-def _read_block(index: Sequence[ChunkIndex], number: int, min_bytes: int,
-                read_chunks: ReadChunks) -> tuple[ChunkBlock, int]:
+def _block_end(index: Sequence[ChunkIndex], number: int, min_bytes: int) -> int:
     """
-    Return the chunks from index ``number`` on, at least ``min_bytes``, and the index after them.
+    Return the end of a block of chunks from ``number`` on, with at least ``min_bytes``.
 
-    Chunks that overlap these in time are added, up to BLOCK_BYTES more bytes.
+    Chunks that overlap these in time are included, up to BLOCK_BYTES more bytes.
     """
-    block: ChunkBlock = []
-    remaining, end_ns = min_bytes, 0
-    # of a range of chunks that are adjacent in the file
-    first, range_end = number, index[number].offset
+    bytes_left, end_ns = min_bytes, 0
     while number < len(index) and (
-            remaining > 0 or (index[number].start_ns < end_ns and remaining > -BLOCK_BYTES)):
+            bytes_left > 0 or (index[number].start_ns < end_ns and bytes_left > -BLOCK_BYTES)):
         entry = index[number]
-        if entry.offset != range_end:
-            block += read_chunks(index[first:number])
-            first = number
-        range_end = entry.offset + entry.size + entry.index_size
         # the larger one: a wrong index may state 0 for the unpacked size
-        remaining -= max(entry.size, entry.unpacked_size)
+        bytes_left -= max(entry.size, entry.unpacked_size)
         end_ns, number = max(end_ns, entry.end_ns), number + 1
-    return block + read_chunks(index[first:number]), number
+    return number
 
 
-def _columns(block: ChunkBlock, is_known: Bools, scan: ScanChunk,
+def _columns(chunks: Sequence[Chunk], is_known: Bools, scan: ScanChunk,
              report_damage: ReportDamage) -> Columns:
     """Return the messages of chunks; where the index is unexpected by a sequential scan."""
-    chunks = [chunk for chunk in block if isinstance(chunk, Chunk)]
     columns = _columns_by_index(chunks, is_known)
+    if columns is not None:
+        return columns
     parts = []
-    for chunk in block:
-        if isinstance(chunk, Damaged):
-            report_damage(chunk)
-        elif columns is None:
-            try:
-                part = _columns_by_index([chunk], is_known)
-                parts.append(_columns_of_messages(scan(chunk)) if part is None else part)
-            except Damaged as error:
-                report_damage(error)
-    return _join(*parts) if columns is None else columns
+    for chunk in chunks:
+        try:
+            part = _columns_by_index([chunk], is_known)
+            parts.append(_columns_of_messages(scan(chunk)) if part is None else part)
+        except Damaged as error:
+            report_damage(error)
+    return _join(*parts)
 
 
 def _channel_mask(channel_numbers: Collection[int]) -> Bools:
@@ -127,13 +123,14 @@ def _channel_mask(channel_numbers: Collection[int]) -> Bools:
 
 def _columns_by_index(chunks: Sequence[Chunk], is_known: Bools) -> Columns | None:
     """Return the messages of chunks; None if any of them has an unexpected layout."""
-    chunks = _concatenated(chunks)
     offsets = [_record_offsets(chunk) for chunk in chunks]
     counts = np.array([len(chunk_offsets) for chunk_offsets in offsets])
     if not chunks or not counts.all():
         return None
-    data = chunks[0].data
-    start = np.sort(np.concatenate(offsets))      # of each record in the data
+    data = b''.join([chunk.records for chunk in chunks])
+    chunk_stop = np.cumsum([len(chunk.records) for chunk in chunks])      # in the data
+    chunk_begin = np.append(0, chunk_stop[:-1])
+    start = np.sort(np.concatenate(offsets) + np.repeat(chunk_begin, counts))      # of each record
     if start[0] < 0 or start[-1] > len(data) - HEAD.itemsize:
         return None
     # a view with a head at every offset of the buffer; only those of records are read
@@ -144,12 +141,11 @@ def _columns_by_index(chunks: Sequence[Chunk], is_known: Bools) -> Columns | Non
     end = counts.cumsum()
     first = end - counts
     stop = np.append(start[1:], 0)
-    stop[end - 1] = [chunk.stop for chunk in chunks]
+    stop[end - 1] = chunk_stop
     size = stop - start - RECORD.size
     is_adjacent = (      # each record begins where the one before it ends
         (head['op'] == MESSAGE).all() and (head['size'] == size).all()
-        and size.min() >= COUNTED_HEAD
-        and start[first].tolist() == [chunk.begin for chunk in chunks])
+        and size.min() >= COUNTED_HEAD and (start[first] == chunk_begin).all())
     time_ns, channel = head['time_ns'].copy(), head['channel'].copy()
     if not (is_adjacent and is_known[channel].all() and _are_times_as_stated(
             chunks, time_ns, first)):
@@ -166,18 +162,6 @@ def _are_times_as_stated(chunks: Sequence[Chunk], time_ns: Ints, first: Ints) ->
                                            strict=True))
 
 
-def _concatenated(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
-    """Return the chunks with their records in one buffer."""
-    if len({id(chunk.data) for chunk in chunks}) <= 1:
-        return chunks
-    data, begin, moved = b''.join([chunk.records for chunk in chunks]), 0, []
-    for chunk in chunks:
-        stop = begin + chunk.stop - chunk.begin
-        moved.append(chunk._replace(data=data, begin=begin, stop=stop))
-        begin = stop
-    return moved
-
-
 def _record_offsets(chunk: Chunk) -> Ints:
     """Return the offsets of the records of a chunk from its message index, in any order."""
     offsets, position, index = [np.empty(0, np.int64)], 0, chunk.message_index
@@ -191,7 +175,7 @@ def _record_offsets(chunk: Chunk) -> Ints:
             break      # of a damaged index offsets are missing: _columns_by_index rejects them
         offsets.append(np.frombuffer(index, '<i8', length // 8, pairs)[1::2])
         position = pairs + length
-    return np.concatenate(offsets) + chunk.begin
+    return np.concatenate(offsets)
 
 
 def _columns_of_messages(entries: Sequence[Entry]) -> Columns:

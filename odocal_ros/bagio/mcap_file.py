@@ -4,11 +4,11 @@
 """
 Read an mcap file: topics, counts and messages.
 
-With a valid index only the chunks with the requested topics are read. Without one, or in a damaged
-file, records are read from the start of the file, as far as they are valid.
+With a valid index only the chunks with the requested topics are read. Without one, or in a
+damaged file, records are read from the start of the file, as far as they are valid.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
 import struct
@@ -100,7 +100,7 @@ class McapFile(BagFile):
         self._allowance.restart()
         chunks = sorted(self._with_own_times(chunk) for chunk in self._chunks
                         if not chunk.channels or chunk.channels & channels.keys())
-        yield from batches(chunks, channels, self._channels, self._read_chunks,
+        yield from batches(chunks, channels, self._channels, self._read_chunk,
                            self._messages_by_scan, self._report_damage)
         self._recount()
 
@@ -110,22 +110,14 @@ class McapFile(BagFile):
         start_ns, end_ns = mcap.TIMES.unpack(self._file[begin:begin + mcap.TIMES.size])
         return chunk._replace(start_ns=start_ns, end_ns=end_ns)
 
-    def _read_chunks(self, chunks: Sequence[mcap.ChunkIndex]) -> list[mcap.Chunk | Damaged]:
-        """Return adjacent chunks from the file, each with its message index."""
-        begin, end = chunks[0].offset, chunks[-1].offset + chunks[-1].size + chunks[-1].index_size
-        data = self._file[begin:end]
-        unpacked: list[mcap.Chunk | Damaged] = []
-        for chunk in chunks:
-            offset = chunk.offset - begin
-            content, stop = offset + mcap.RECORD.size, offset + chunk.size
-            try:
-                if data[offset:content] != mcap.RECORD.pack(mcap.CHUNK, stop - content):
-                    raise Damaged(mcap.CHUNK_DAMAGED)
-                unpacked.append(mcap.unpack_chunk(data, content, stop, self._allowance)._replace(
-                    message_index=memoryview(data)[stop:stop + chunk.index_size]))
-            except Damaged as error:
-                unpacked.append(error)
-        return unpacked
+    def _read_chunk(self, index: mcap.ChunkIndex) -> mcap.Chunk:
+        """Return a chunk from the file, with its message index, or raise Damaged."""
+        data = self._file[index.offset:index.offset + index.size + index.index_size]
+        content = mcap.RECORD.size      # where it begins
+        if data[:content] != mcap.RECORD.pack(mcap.CHUNK, index.size - content):
+            raise Damaged(mcap.CHUNK_DAMAGED)
+        chunk = mcap.unpack_chunk(memoryview(data)[content:index.size], self._allowance)
+        return chunk._replace(message_index=data[index.size:])
 
     def _report_damage(self, damage: Damaged) -> None:
         self.damage = self.damage or str(damage)
@@ -145,11 +137,8 @@ class McapFile(BagFile):
     def _scan_index(self) -> Iterator[mcap.Entry]:
         """Yield every message in the chunks of the index."""
         for index in self._chunks:
-            (chunk,) = self._read_chunks([index])
             try:
-                if isinstance(chunk, Damaged):
-                    raise chunk
-                yield from self._messages_by_scan(chunk)
+                yield from self._messages_by_scan(self._read_chunk(index))
             except Damaged as error:
                 self._report_damage(error)
 
@@ -158,8 +147,7 @@ class McapFile(BagFile):
         for op, body, is_complete in mcap.records_of(self._file, len(mcap.MAGIC)):
             try:
                 if op == mcap.CHUNK:
-                    chunk = mcap.unpack_chunk(body, 0, len(body), self._allowance,
-                                              is_truncated=not is_complete)
+                    chunk = mcap.unpack_chunk(body, self._allowance, not is_complete)
                     yield from self._messages_by_scan(chunk, is_truncated=not is_complete)
                 elif op == mcap.MESSAGE:
                     yield self._entry(body)

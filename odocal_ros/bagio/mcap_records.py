@@ -57,10 +57,10 @@ def records_of(data: bytes | FileBytes, offset: int = 0) -> Iterator[tuple[int, 
         if op == FOOTER:
             return
         offset = begin + size
-        complete = offset <= len(data)
-        if op in USED and complete or op == CHUNK:      # also a truncated last chunk
-            end = offset if complete else min(offset, begin + MAX_TRUNCATED)
-            yield op, data[begin:end], complete
+        is_complete = offset <= len(data)
+        if op in USED and is_complete or op == CHUNK:      # also a truncated last chunk
+            end = offset if is_complete else min(offset, begin + MAX_TRUNCATED)
+            yield op, data[begin:end], is_complete
 
 
 def chunk_index_of(body: bytes) -> ChunkIndex:
@@ -81,15 +81,14 @@ def ordered_chunks(chunks: Sequence[ChunkIndex], end: int) -> list[ChunkIndex]:
 
     Raises Damaged if they overlap in the file or exceed ``end``: they could unpack to any size.
     """
-    chunks, checked, offset = sorted(chunks, key=attrgetter('offset')), [], len(MAGIC)
+    chunks, valid, offset = sorted(chunks, key=attrgetter('offset')), [], len(MAGIC)
     for chunk, next_offset in zip(chunks, [*(c.offset for c in chunks[1:]), end], strict=True):
-        if (chunk.offset < offset or chunk.size < RECORD.size
-                or chunk.offset + chunk.size > end):
+        if chunk.offset < offset or chunk.size < RECORD.size or chunk.offset + chunk.size > end:
             raise Damaged(INDEX_DAMAGED)
         offset = chunk.offset + chunk.size
         space = max(next_offset - offset, 0)
-        checked.append(chunk._replace(index_size=min(chunk.index_size, space)))
-    return sorted(checked)      # by the first field, the start time
+        valid.append(chunk._replace(index_size=min(chunk.index_size, space)))
+    return sorted(valid)      # by the first field, the start time
 
 
 def statistics_of(body: bytes) -> tuple[int, int, int, dict[int, int]]:
@@ -106,37 +105,26 @@ def text_at(body: Bytes, offset: int) -> tuple[str, int]:
 
 
 class Chunk(NamedTuple):
-    """A decompressed chunk: its records ``data[begin:stop]``, and its stated times."""
+    """A decompressed chunk and its stated times."""
 
-    data: Bytes                  # may contain several chunks that were read at once
-    begin: int
-    stop: int
+    records: Bytes
     start_ns: int
     end_ns: int
     message_index: Bytes = b''   # the index after the chunk in the file, not verified
 
-    @property
-    def records(self) -> memoryview:
-        return memoryview(self.data)[self.begin:self.stop]
 
-
-def unpack_chunk(data: Bytes, begin: int, stop: int, allowance: Allowance,
-                 is_truncated: bool = False) -> Chunk:
-    """Return the chunk in data[begin:stop], the content of a record, or raise Damaged."""
-    body = memoryview(data)[begin:stop]
+def unpack_chunk(body: Bytes, allowance: Allowance, is_truncated: bool = False) -> Chunk:
+    """Return the chunk in the content of a record, or raise Damaged."""
     try:
         start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
         compression, offset = text_at(body, CHUNK_HEAD.size)
         (length,) = struct.unpack_from('<Q', body, offset)
-        packed = body[offset + 8:offset + 8 + length]
+        packed = memoryview(body)[offset + 8:offset + 8 + length]
         records = allowance.unpack(compression, packed, size)
     except (LimitReached, MemoryError):
         raise
     except Exception:    # each compression has its own error
         raise Damaged(CHUNK_DAMAGED) from None
-    if not is_truncated and (
-            len(records) != size or crc and zlib.crc32(records) != crc):
+    if not is_truncated and (len(records) != size or crc and zlib.crc32(records) != crc):
         raise Damaged(CHUNK_DAMAGED)
-    if compression:
-        return Chunk(records, 0, len(records), start_ns, end_ns)
-    return Chunk(data, begin + offset + 8, begin + offset + 8 + len(records), start_ns, end_ns)
+    return Chunk(records, start_ns, end_ns)
