@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reason codes: findings on a leg or a calibration, their severity and remedy."""
+"""Reasons of a verdict: findings on a leg or a calibration, with their severity and remedy."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ NOTE, CAUTION, REJECT = Verdict.ACCEPTED, Verdict.CAUTION, Verdict.REJECTED
 
 
 class Code(Enum):
-    """A reason code: (severity, remedy)."""
+    """A reason code: its severity, and its remedy if the reason has no special one."""
 
     # topics and messages
-    NO_IMU = REJECT, ('Check the IMU topic and its QoS, or name the topic with --imu-topic. A '
-                      'robot without an IMU: set odometer.left and odometer.right, or '
+    NO_IMU = REJECT, ('Check the IMU topic and its QoS, or name the topic with --imu-topic. For a '
+                      'robot without an IMU, set odometer.left and odometer.right, or '
                       'odometer.wheels.')
     NO_ACCELEROMETER = CAUTION, ('For yaw and pitch use an IMU that publishes specific force and '
                                  'three turn rates (REP-145); for the yaw, an external heading is '
@@ -62,20 +62,20 @@ class Code(Enum):
                        'chrony), and adjust it gradually.')
     CLOCKS_DRIFT = NOTE, ('Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with '
                           'one clock. The drift matters to all software that combines them.')
-    DELAY_SEEN = NOTE, ('Apply the same offset in every other program that combines these '
-                        'sensors. In odocal, set it for the two-point method.')
+    DELAY_SEEN = NOTE, ('Set the stated time_offset for the two-point method, and in every other '
+                        'program that combines these sensors.')
     ODOMETER_LATE = NOTE, ('Publish the counter with a header stamped at the time of reading, or '
                            'reduce bus or CPU load. The late messages were moved back to their '
                            'estimated times.')
     COUNTER_RESET = CAUTION, 'Keep the encoder and its counter powered during a leg.'
-    COUNTER_ROLLOVER = NOTE, ('No action needed. The modulus is odometer.wrap or that of the '
-                              'integer type.')
-    SPEED_COARSE = NOTE, ('If available, use wheel pulses or a finer speed signal of the same '
+    COUNTER_ROLLOVER = NOTE, ('No action needed. The modulus is the setting odometer.wrap, or by '
+                              'default that of the integer type.')
+    SPEED_COARSE = NOTE, ('If available, use wheel pulses or a finer speed signal from the same '
                           'bus. The smoother reduces this error: it uses the step transitions.')
     SPEED_ON_CHANGE = NOTE, ('If available, use wheel pulses or a speed that is published at a '
                              'fixed rate.')
     SPEED_FILTERED = NOTE, ('No action needed. For dead reckoning, wheel pulses or an unfiltered '
-                            'speed signal of the same bus are better.')
+                            'speed signal from the same bus are better.')
     COUNTER_COARSE = NOTE, ('If available, use a counter with more pulses per metre. Otherwise '
                             'drive farther: quantisation averages out with distance.')
     REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '
@@ -93,11 +93,11 @@ class Code(Enum):
                                  'axes are forward-right-down.')
     IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up. '
                         'odocal inspect prints the possible values.')
-    IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the other noise '
-                                     'settings, to the values of this IMU. A gyro in deg/s also '
-                                     'looks like this: then set imu.gyro_scale.')
-    IMU_SATURATED = NOTE, ('Set a larger range in the IMU or its driver, or mount it more softly. '
-                           'The mean of a saturated axis is wrong.')
+    IMU_WORSE_THAN_GRADE = CAUTION, (
+        'Set imu.grade, or imu.gyro_noise and the other noise settings, to the values of this '
+        'IMU. A gyro that sends deg/s has the same effect: then set imu.gyro_scale to 0.0174533.')
+    IMU_SATURATED = NOTE, ('Set a larger range in the IMU or its driver, or mount the IMU on '
+                           'dampers. The mean of a saturated axis is wrong.')
     GYRO_DEAD_BAND = CAUTION, ('Switch off the dead band of the IMU or its driver (a zero-rate '
                                'filter), and drive again.')
     IMU_BIAS_STEP = NOTE, ('No action needed for this leg. Check that the IMU is firmly mounted '
@@ -111,9 +111,8 @@ class Code(Enum):
                               'base_link: x forward, y left, z up): only their difference is '
                               'estimated. A vehicle that slides in turns (skid steering, '
                               'tracks) also looks like this: then change nothing.')
-    GYRO_SIGN = REJECT, ('Correct the signs in the IMU driver, or the order of the '
-                         'coordinates. imu.mounting_rpy cannot: it rotates gyro and accelerometer '
-                         'together.')
+    GYRO_SIGN = REJECT, ('Correct the signs or the order of the axes in the IMU driver. '
+                         'imu.mounting_rpy cannot: it rotates gyro and accelerometer together.')
     GYRO_AXES = REJECT, ('Correct the axes of angular_velocity in the IMU driver. '
                          'imu.mounting_rpy cannot: it rotates gyro and accelerometer together.')
     BAG_TRUNCATED = CAUTION, ('Stop recordings with Ctrl-C. An invalid chunk is an error of '
@@ -130,7 +129,7 @@ class Code(Enum):
     FIX_OUTLIERS = NOTE, ('Check the antenna and its sky view, or the localisation. The '
                           'comparison of track and fixes includes these fixes.')
     VELOCITY_UNUSABLE = NOTE, ('Publish east, north, up in m/s on fix_velocity, or set '
-                               'gnss.use_velocity to false. The leg is estimated without it.')
+                               'gnss.use_velocity to false. The result does not use it.')
     # the drive
     NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark. Level, gyro '
                               'bias and heading are then measured at rest.')
@@ -151,21 +150,20 @@ class Code(Enum):
                            'The uncertainty includes the detected slip.')
     TRAVEL_MISSING = NOTE, ('Check the odometer at low speed: truncated speeds, a dead band, or a '
                             'sensor that misses pulses. The uncertainty was increased.')
-    TRAVEL_EXCESS = NOTE, ('Check the odometer before stops: a speed that is held or late. The '
-                           'uncertainty was increased.')
+    TRAVEL_EXCESS = NOTE, ('Check whether the odometer holds or delays its speed before stops. '
+                           'The uncertainty was increased.')
     SCALE_VARIES = NOTE, ('No action needed. For a value that stays valid longer, drive with '
                           'warm tyres at typical speeds, and combine several legs.')
     CHANGE_IN_LEG = CAUTION, ('Check the mounting of the IMU, the tyres, the load and the '
                               'odometer. Then drive again, or use the section before or after '
-                              'this time (--leg). The value is a mean of both sections.')
+                              'this time (--leg). The result is a mean of both sections.')
     FIXES_SMOOTHED = NOTE, ('If possible, switch off smoothing in the receiver (position filter, '
                             'static hold) or the localisation: unfiltered fixes contain more '
                             'information.')
-    FIXES_FOLLOW_ODOMETER = CAUTION, ('Use positions that do not contain the wheel odometry. '
-                                      'Receiver: the topic before fusion, or dead reckoning '
-                                      'switched off. SLAM, AMCL, robot_localization: a source '
-                                      'without wheels (scan matching alone, lidar or visual '
-                                      'odometry, motion capture). Then drive again.')
+    FIXES_FOLLOW_ODOMETER = CAUTION, (
+        'Use positions that do not contain the wheel odometry. Receiver: the topic before fusion, '
+        'or dead reckoning switched off. SLAM, AMCL, robot_localization: a source without wheels '
+        '(scan matching alone, lidar or visual odometry, motion capture). Then drive again.')
     FIXES_DEAD_RECKONED = CAUTION, ('Switch off dead reckoning in the receiver, or drive a leg '
                                     'without tunnels. The other fixes were used.')
     # the estimate
@@ -203,7 +201,7 @@ class Code(Enum):
     WHEEL_DEAD = REJECT, ('Check the sensor and wiring of this wheel, or calibrate the other '
                           'wheel alone: set odometer.field to its joint or index.')
     WHEEL_LEFT_OUT = CAUTION, ('Check the sensor and wiring of this wheel. The scale factor is '
-                               'that of the mean of the other axles.')
+                               'valid for the mean of the other axles.')
     WHEELS_STEERED = NOTE, ('No action needed. If these wheels do not steer, check the turn rate '
                             'of the gyro and the order of odometer.wheels.')
     WHEEL_DEPARTS = NOTE, ('Check tyre pressure, tyre size and the counts per revolution of '
@@ -218,7 +216,7 @@ class Code(Enum):
     SEARCH_NOT_SETTLED = CAUTION, ('Widen wheels.radius_range and wheels.heading_range, or '
                                    'correct the start values: odometer.nominal_scale and the '
                                    'heading.')
-    # all the samples at once
+    # the smoother, and the choice between methods
     NOT_CONVERGED = REJECT, ('Check units, axes and clocks with odocal inspect, and the number of '
                              'publishers with ros2 topic info. Then drive a leg with stops and '
                              'turns. The other methods may still have a result.')
@@ -226,16 +224,16 @@ class Code(Enum):
     YAW_NOT_DETERMINED = CAUTION, ('Drive with stops, starts and turns: the yaw is estimated '
                                    'from accelerations.')
     PARAMETER_NOT_DETERMINED = NOTE, ('No action needed if the configured values were measured. '
-                                      'Turns, stops and starts determine more of them.')
+                                      'Turns, stops and starts determine more values.')
     MODEL_MISMATCH = CAUTION, ('The printed action depends on the deviation. Likely causes: slip, '
                                'bad fixes, lever arms, delays, the unit of heights, a wrong '
                                'external heading, slopes.')
-    METHOD_REJECTED = CAUTION, ('Follow the action of the reason named. The values come from '
+    METHOD_REJECTED = CAUTION, ('Follow the action of the named reason. The values come from '
                                 'another method, which may not detect this problem.')
     METHOD_FAILED = REJECT, ('Please report this with the trace file. The other methods are not '
                              'affected.')
-    METHODS_DISAGREE = CAUTION, ('Check the cause that METHODS_DISAGREE names. Drive again with '
-                                 'stops at both marks and turns in between.')
+    METHODS_DISAGREE = CAUTION, ('Check the cause that this message names. Drive again with stops '
+                                 'at both marks and turns in between.')
     # several legs, several calibrations
     LEGS_DISAGREE = CAUTION, ('Find the leg that differs. Likely causes: tyre pressure, load or '
                               'slip (scale), a moved IMU (angles), driver timing (delays), bad '
@@ -282,19 +280,19 @@ class Reason:
 
 def most_severe_first(reasons: Iterable['Reason']) -> list['Reason']:
     """Return reasons by their severity; those of the same severity stay in order."""
-    return sorted(reasons, key=lambda r: -SEVERITY.index(r.code.severity))
+    return sorted(reasons, key=lambda reason: -SEVERITY.index(reason.code.severity))
 
 
 def cautions(reasons: Iterable['Reason']) -> list['Reason']:
     """Return the reasons that lower the verdict, the most severe first."""
-    return [r for r in most_severe_first(reasons) if r.code.severity is not NOTE]
+    return [reason for reason in most_severe_first(reasons) if reason.code.severity is not NOTE]
 
 
 def rejecting(reasons: Iterable['Reason']) -> list['Reason']:
     """Return the reasons that reject a leg, a method or a calibration."""
-    return [reason for reason in reasons if reason.code.severity is Verdict.REJECTED]
+    return [reason for reason in reasons if reason.code.severity is REJECT]
 
 
 def verdict_of(reasons: Iterable['Reason']) -> Verdict:
     """Return the most severe verdict of the reasons."""
-    return Verdict.worst(r.code.severity for r in reasons)
+    return Verdict.worst(reason.code.severity for reason in reasons)

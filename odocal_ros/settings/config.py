@@ -39,8 +39,8 @@ def _place(about: str) -> Any:
 def _arrival() -> Any:
     """Declare whether messages are stamped by their arrival."""
     return setting(False, read_only=True, about=(
-        'Use the arrival time of messages in place of their stamp, if that is 0 or of another '
-        'clock (time since boot).'))
+        'Use the arrival time of messages instead of their stamp: for stamps that are 0 or from '
+        'another clock (time since boot).'))
 
 
 def _figure(unit: str, high: float, about: str, nan: str = 'value of the grade') -> Any:

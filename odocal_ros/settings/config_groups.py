@@ -95,12 +95,12 @@ class UpdaterConfig:
 
 def _lower_limit(value: str, unit: str) -> Any:
     return setting(NAN, unit, about=f'Lower acceptance limit of {value}: value minus 2 sigma must '
-                   'not be below. NaN: no limit.')
+                   'not be below it. NaN: no limit.')
 
 
 def _upper_limit(value: str, unit: str) -> Any:
     return setting(NAN, unit, about=f'Upper acceptance limit of {value}: value plus 2 sigma must '
-                   'not be above. NaN: no limit.')
+                   'not be above it. NaN: no limit.')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,9 +32,9 @@ class Setting:
     name: str
     default: Any              # if NaN, the value may be NaN
     unit: str = ''
-    low: float | None = None
+    low: float | None = None         # range of the value
     high: float | None = None
-    about: str = ''
+    about: str = ''                  # description, in docs/settings.md
     choices: Sequence[str] = ()
     read_only: bool = False          # read-only after start-up
     frame: bool = False       # the value is the name of a coordinate frame
@@ -55,8 +55,9 @@ class Setting:
                 raise BadConfig(f'{self.name}: {value!r} is not a list; required: a list '
                                 'such as [A, B, C]')
             if self.item is str:        # an index is a name too
-                return tuple(self._check_item(str(v) if type(v) is int else v, str) for v in value)
-            items = tuple(self._check_item(v, float) for v in value)
+                return tuple(self._check_item(str(item) if type(item) is int else item, str)
+                             for item in value)
+            items = tuple(self._check_item(item, float) for item in value)
             lengths = (3,) if self.default else (0, 4)
             if len(items) not in lengths and not self.any_length:
                 raise BadConfig(f'{self.name}: {len(items)} values; required: {lengths[-1]}')
@@ -106,16 +107,17 @@ def setting(default: object, *values: Any, **named_values: Any) -> Any:
 
 
 def _settings(owner: Settings, prefix: str = '') -> Iterator[Setting]:
-    for f in fields(owner):
-        if is_dataclass(f.default) and not isinstance(f.default, type):
-            yield from _settings(f.default, f'{prefix}{f.name}.')
+    for declared in fields(owner):
+        if is_dataclass(declared.default) and not isinstance(declared.default, type):
+            yield from _settings(declared.default, f'{prefix}{declared.name}.')
         else:
-            yield replace(f.metadata['setting'], name=prefix + f.name)
+            yield replace(declared.metadata['setting'], name=prefix + declared.name)
 
 
 @cache
 def settings_of(kind: type) -> dict[str, Setting]:
-    return {s.name: s for s in _settings(kind())}
+    """Return the settings of a dataclass by dotted name."""
+    return {declared.name: declared for declared in _settings(kind())}
 
 
 def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
@@ -136,5 +138,6 @@ def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
         group, _, leaf = name.rpartition('.')
         groups.setdefault(group, {})[leaf] = settings[name].checked(value)
     top = groups.pop('', {})
-    nested = {g: replace(getattr(config, g), **values) for g, values in groups.items()}
+    nested = {group: replace(getattr(config, group), **values)
+              for group, values in groups.items()}
     return replace(config, **top, **nested)
