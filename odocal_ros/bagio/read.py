@@ -50,21 +50,22 @@ class Bag:
     messages for the user: sentences, and reasons if they concern a result.
     """
 
-    def __init__(self, source: Source, parts: list[BagFile], types: Types) -> None:
+    def __init__(self, source: Source, bag_files: list[BagFile], types: Types) -> None:
         self.name, self.files = source.name, source.files
         self._source, self._types = source, types
-        self._parts = sorted((p for p in parts if p.count), key=lambda p: p.start_ns)
+        self._bag_files = sorted((file for file in bag_files if file.count),
+                                 key=lambda file: file.start_ns)
         self._reader_notes: list[Reason] = []
         self._sentences = list(source.notes)
         self.topics = self._find_topics()
-        self.start_ns = min(p.start_ns for p in self._parts)
-        self.end_ns = max(p.end_ns for p in self._parts)
+        self.start_ns = min(file.start_ns for file in self._bag_files)
+        self.end_ns = max(file.end_ns for file in self._bag_files)
 
     def _find_topics(self) -> dict[str, TopicInfo]:
         """Return the topics of all files, each with its most frequent type."""
         counts: dict[str, dict[str, int]] = {}
-        for part in self._parts:
-            for channel in part.channels:
+        for bag_file in self._bag_files:
+            for channel in bag_file.channels:
                 self._types.define(channel.msgtype, channel.definition)
                 types = counts.setdefault(channel.topic, {})
                 types[channel.msgtype] = types.get(channel.msgtype, 0) + channel.count
@@ -85,27 +86,27 @@ class Bag:
         """Return notes on missing data, with its duration if metadata or the next file give it."""
         notes: list[Reason | str] = []
         metadata = self._source.metadata
-        for part, next_part in zip(self._parts, [*self._parts[1:], None], strict=True):
-            if not part.damage:
+        for bag_file, next_file in zip(self._bag_files, [*self._bag_files[1:], None], strict=True):
+            if not bag_file.damage:
                 continue
-            span = metadata.file_spans.get(part.recorded_path.name) or (
-                metadata.bag_span if len(self._parts) == 1 else None)
-            damage = f'{part.recorded_path.name} is damaged ({part.damage})'
-            if span and part.count >= span.count:
+            span = metadata.file_spans.get(bag_file.recorded_path.name) or (
+                metadata.bag_span if len(self._bag_files) == 1 else None)
+            damage = f'{bag_file.recorded_path.name} is damaged ({bag_file.damage})'
+            if span and bag_file.count >= span.count:
                 notes.append(f'{damage}, but all {span.count} messages were read')
                 continue
-            if not part.count:
+            if not bag_file.count:
                 notes.append(Reason(Code.BAG_TRUNCATED, f'{damage}: none of its messages can be '
                                     'read'))
                 continue
-            span = span or (metadata.bag_span if next_part is None else None)
-            end_ns = span.end_ns if span else next_part.start_ns if next_part else None
-            seconds = (part.end_ns - part.start_ns) * 1e-9
-            lost_s = 0.0 if end_ns is None else (end_ns - part.end_ns) * 1e-9
+            span = span or (metadata.bag_span if next_file is None else None)
+            end_ns = span.end_ns if span else next_file.start_ns if next_file else None
+            seconds = (bag_file.end_ns - bag_file.start_ns) * 1e-9
+            lost_s = 0.0 if end_ns is None else (end_ns - bag_file.end_ns) * 1e-9
             loss = ('without metadata.yaml the lost time is unknown' if end_ns is None else
                     f'{lost_s:.1f} s at the end are missing' if lost_s > MIN_LOSS_S else
                     'the end is there, messages before it are missing')
-            notes.append(Reason(Code.BAG_TRUNCATED, f'{damage}: {part.count} messages in '
+            notes.append(Reason(Code.BAG_TRUNCATED, f'{damage}: {bag_file.count} messages in '
                                 f'{seconds:.1f} s were read; {loss}'))
         lost_s = (metadata.bag_span.end_ns - self.end_ns) * 1e-9 if metadata.bag_span else 0.0
         if not notes and lost_s > MIN_LOSS_S:
@@ -138,7 +139,8 @@ class Bag:
             if progress:
                 newest = int(max(times[-1] for times, _ in batch.values()))
                 progress((newest - self.start_ns) / max(self.end_ns - self.start_ns, 1))
-        _check_has_messages(self.name, self._source, self._parts)  # reading finds damaged chunks
+        # reading finds damaged chunks
+        _check_has_messages(self.name, self._source, self._bag_files)
         for topic, reader in readers.items():
             self._add_notes(topic, reader, row_counts[topic])
 
@@ -185,15 +187,16 @@ class Bag:
     def _batches(self, topics: Collection[str]) -> Iterator[Batch]:
         """Yield messages of some topics in order of bag time, many at a time."""
         types = {t: self.topics[t].msgtype for t in topics if self.topics[t].count}
-        for group in group_overlapping(self._parts):
+        for group in group_overlapping(self._bag_files):
             yield from _merged(group, types)
 
 
-def _merged(parts: list[BagFile], topics: Mapping[str, str]) -> Iterator[Batch]:
+def _merged(bag_files: list[BagFile], topics: Mapping[str, str]) -> Iterator[Batch]:
     """Return the batches of files that overlap in time, merged; those of one file unchanged."""
-    if len(parts) == 1:
-        return parts[0].batches(topics)
-    return in_batches(heapq.merge(*(part.stream(topics) for part in parts), key=itemgetter(1)))
+    if len(bag_files) == 1:
+        return bag_files[0].batches(topics)
+    return in_batches(heapq.merge(*(file.stream(topics) for file in bag_files),
+                                  key=itemgetter(1)))
 
 
 @contextmanager
@@ -205,7 +208,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     """
     with ExitStack() as stack:
         try:
-            bag = _open_parts(Path(path), stack)
+            bag = _open_bag(Path(path), stack)
         except PermissionError as error:
             raise BadBag(f'{error.filename or path}: no permission to read it') from None
         except OSError as error:
@@ -213,33 +216,33 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
         yield bag
 
 
-def _open_parts(path: Path, stack: ExitStack) -> Bag:
+def _open_bag(path: Path, stack: ExitStack) -> Bag:
     source, types = find_source(path), Types()
     if foreign := source.metadata.foreign_formats:
         raise BadBag(f'{path}: its serialization format is {foreign!r}, only cdr is supported; '
                      'convert the bag with ros2 bag convert')
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
-    parts: list[BagFile] = []
+    bag_files: list[BagFile] = []
     errors = []
     total = sum(path.stat().st_size for path in source.files if is_file(path))
     for path in source.files:
         try:
-            part = _open_file(path, folder, total, types)
+            bag_file = _open_file(path, folder, total, types)
         except BadBag as error:
             errors.append(error)
             continue
-        stack.callback(part.close)
-        parts.append(part)
-    if not parts:
+        stack.callback(bag_file.close)
+        bag_files.append(bag_file)
+    if not bag_files:
         raise errors[0]
     bag_notes = tuple(Reason(Code.BAG_TRUNCATED, f'{error}; the other files are read')
                       for error in errors)
-    formats = {c.serialization for part in parts for c in part.channels if c.count}
+    formats = {c.serialization for bag_file in bag_files for c in bag_file.channels if c.count}
     if formats and not formats & {'cdr', 'ros1'}:
         raise BadBag(f'{path}: its serialization format is {", ".join(formats)!r}, '
                      'only cdr is supported; convert the bag with ros2 bag convert')
-    _check_has_messages(path, source, parts)
-    return Bag(replace(source, notes=source.notes + bag_notes), parts, types)
+    _check_has_messages(path, source, bag_files)
+    return Bag(replace(source, notes=source.notes + bag_notes), bag_files, types)
 
 
 def _open_file(path: Path, folder: Path, total: int, types: Types) -> BagFile:
@@ -247,23 +250,23 @@ def _open_file(path: Path, folder: Path, total: int, types: Types) -> BagFile:
     file, kind = unpack(path, folder, total)
     allowance = Allowance(path, total)
     try:
-        part: BagFile = (McapFile(file, allowance) if kind == '.mcap' else
+        bag_file: BagFile = (McapFile(file, allowance) if kind == '.mcap' else
                          SqliteFile(file, allowance) if kind == '.db3' else
                          Rosbag1File(file, allowance, types.cdr_from_ros1))
     except (Damaged, ValueError) as error:
         raise BadBag(f'{path}: cannot be read ({error})') from None
-    part.recorded_path = path
-    return part
+    bag_file.recorded_path = path
+    return bag_file
 
 
-def _check_has_messages(path: Path | str, source: Source, parts: list[BagFile]) -> None:
-    if any(part.count for part in parts):
+def _check_has_messages(path: Path | str, source: Source, bag_files: list[BagFile]) -> None:
+    if any(bag_file.count for bag_file in bag_files):
         return
-    damage = ' or '.join({part.damage for part in parts if part.damage})
+    damage = ' or '.join({bag_file.damage for bag_file in bag_files if bag_file.damage})
     if damage:
         raise BadBag(f'{path}: the messages of {file_names(source.files)} cannot be read '
                      f'({damage}); copy it again from its source')
-    topics = sum(len(part.channels) for part in parts)
+    topics = sum(len(bag_file.channels) for bag_file in bag_files)
     raise BadBag(f'{path}: the bag is empty, 0 messages on {topics} topics in '
                  f'{file_names(source.files)}; record again')
 

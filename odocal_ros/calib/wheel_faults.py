@@ -54,21 +54,20 @@ class Window(NamedTuple):
     is_large: Bools      # (n,) True beyond the limit
 
 
-def wheel_faults(axle: Sequence[Travel], imu: ImuRows,
-                 marks: tuple[float, float], track: Track, latitude: float,
-                 metres_per_unit: float, track_width: float = 0.0,
+def wheel_faults(axle: Sequence[Travel], imu: ImuRows, t_stop: float, track: Track,
+                 latitude: float, metres_per_unit: float, track_width: float = 0.0,
                  uncertain_t: Sequence[float] | Floats = (), max_deviation: float = 0.35,
                  wheel_count: int = 2) -> tuple[tuple[Reason, ...], slip.WheelSlips]:
     """
     Return the faults of two counting wheels by the gyro, and the slips of one of them.
 
-    axle : left and right wheel.   marks : start and stop, s.   track : dead reckoned with the mean
-    of both, for attitudes.   latitude : rad.   metres_per_unit : approximate scale of the mean.
+    axle : left and right wheel.   t_stop : s, stop mark.   track : dead reckoned with the mean of
+    both, for attitudes.   latitude : rad.   metres_per_unit : approximate scale of the mean.
     track_width : m, 0 unknown.   uncertain_t : (d,) s, times of travel that is uncertain for
     other reasons (gaps, resets).   max_deviation : limit of the ratio of the counts minus one.
     wheel_count : number of wheels in the mean.
     """
-    pair = wheels_on_grid(axle, imu, marks, slip.SLIP_GRID, uncertain_t)
+    pair = wheels_on_grid(axle, imu, t_stop, slip.SLIP_GRID, uncertain_t)
     if pair is None or not metres_per_unit:
         return (), slip.NO_SLIPS
     pair = regression.without_gyro_drift(pair)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import math
 import mmap
 import os
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -76,7 +76,9 @@ class Rows:
 
     def forget(self, is_old: Callable[[Samples], Bools]) -> None:
         """Drop leading blocks in which ``is_old``, (n,) bool of a block, is true for all rows."""
-        if self._file is not None and is_old(self._file.row(self._file_rows // 2)).all():
+        middle = self._file_rows // 2
+        if self._file is not None and is_old(
+                take(self._file.rows(self._file_rows), slice(middle, middle + 1))).all():
             # only the pre-roll of the next leg, a small part, is still needed: copied to memory
             rows = self.all()
             count, kept = len(rows.stamp_ns), np.flatnonzero(~is_old(rows))
@@ -113,19 +115,26 @@ class Rows:
             self._file = self._file if self._file_rows else None
 
 
+class _Column(NamedTuple):
+    """A column of samples in an unnamed file."""
+
+    file: BinaryIO
+    dtype: np.dtype[Any]        # of the values
+    shape: tuple[int, ...]      # of a row
+
+
 class _Columns:
     """Samples of one type in unnamed files, one for each column, of the columns of ``example``."""
 
     def __init__(self, example: Samples) -> None:
         self._type = type(example)
-        # file, type of the values, shape of a row
-        self._files: list[tuple[BinaryIO, np.dtype[Any], tuple[int, ...]]] = [
-            (unnamed_file(), column.dtype, column.shape[1:]) for column in columns_of(example)]
+        self._columns = [_Column(unnamed_file(), values.dtype, values.shape[1:])
+                         for values in columns_of(example)]
 
     def write(self, block: Samples, first_row: int) -> None:
         """Write a block from a row of the files on; raises OSError if the disk is full."""
-        for (file, dtype, shape), column in zip(self._files, columns_of(block), strict=True):
-            data = np.ascontiguousarray(column, dtype).reshape(-1).view(np.uint8).data
+        for (file, dtype, shape), values in zip(self._columns, columns_of(block), strict=True):
+            data = np.ascontiguousarray(values, dtype).reshape(-1).view(np.uint8).data
             offset, done = first_row * dtype.itemsize * math.prod(shape), 0
             while done < len(data):
                 done += os.pwrite(file.fileno(), data[done:done + WRITE_BYTES], offset + done)
@@ -135,16 +144,7 @@ class _Columns:
         return from_columns(self._type, *(
             np.frombuffer(map_file(file, 0, mmap.ACCESS_READ), dtype,
                           stop * math.prod(shape)).reshape(stop, *shape)
-            for file, dtype, shape in self._files))
-
-    def row(self, number: int) -> Samples:
-        """Return one row, read from the files."""
-        columns = []
-        for file, dtype, shape in self._files:
-            size = dtype.itemsize * math.prod(shape)
-            data = os.pread(file.fileno(), size, number * size)
-            columns.append(np.frombuffer(data, dtype).reshape(1, *shape))
-        return from_columns(self._type, *columns)
+            for file, dtype, shape in self._columns))
 
 
 def _size(block: Samples) -> int:

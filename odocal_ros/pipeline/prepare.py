@@ -132,7 +132,7 @@ def _compare_wheels(inputs: Inputs, config: Config, located: LocatedFixes, track
     from odocal_ros.calib.wheel_faults import wheel_faults
     odometer, count = config.odometer, sum(not wheel.distance_ahead for wheel in inputs.travels)
     axle_reasons, wheel_slips = zip(*(wheel_faults(
-        axle, inputs.imu, (0.0, inputs.t_stop), track, located.origin.latitude,
+        axle, inputs.imu, inputs.t_stop, track, located.origin.latitude,
         located.rough_scale, odometer.track_width, inputs.uncertain_t,
         odometer.max_scale_deviation, count) for axle in fixed), strict=True)
     return tuple(chain(*axle_reasons)), join_axles(wheel_slips, count)

@@ -41,22 +41,22 @@ def pair_wheels(wheels: Sequence[Wheel]) -> list[tuple[Wheel, ...]]:
 
 
 def usable_axles(wheels: LegWheels, imu: ImuRows,
-                 marks: tuple[float, float]) -> tuple[LegWheels, list[Reason]]:
+                 t_stop: float) -> tuple[LegWheels, list[Reason]]:
     """
     Return the usable wheels, with ``distance_ahead`` of steered ones, and reasons.
 
-    marks : start and stop, s. A broken axle is left out if another one is usable and does not
-    steer: one wheel does not measure the travel of the axle's middle.
+    A broken axle is left out if another one is usable and does not steer: one wheel does not
+    measure the travel of the axle's middle.
     """
     axles = pair_wheels(wheels.wheels)
-    faults = [_axle_faults(axle, axles, imu, marks) for axle in axles]
+    faults = [_axle_faults(axle, axles, imu, t_stop) for axle in axles]
     all_faults = list(chain(*faults))
     if len(axles) < 2:
         return wheels, all_faults
     # the working wheel of a broken axle is used to detect steering of the others
     tested = [_working_wheel(axle, axle_faults) if axle_faults else axle
               for axle, axle_faults in zip(axles, faults, strict=True)]
-    distances = _distances_ahead(tested, imu, marks, wheels.uncertain_t)
+    distances = _distances_ahead(tested, imu, t_stop, wheels.uncertain_mean.t)
     working = [replace(wheel, distance_ahead=distance)
                for axle, axle_faults, distance in zip(axles, faults, distances, strict=True)
                if not axle_faults for wheel in axle]
@@ -85,7 +85,7 @@ def _path_length(wheel: Travel) -> float:
 
 
 def _axle_faults(axle: Axle, axles: list[Axle], imu: ImuRows,
-                 marks: tuple[float, float]) -> tuple[Reason, ...]:
+                 t_stop: float) -> tuple[Reason, ...]:
     """Return the faults of an axle; a single wheel is compared with the first axle."""
     longest = max(_path_length(wheel) for other in axles for wheel in other)
     path = max(map(_path_length, axle))
@@ -95,30 +95,30 @@ def _axle_faults(axle: Axle, axles: list[Axle], imu: ImuRows,
                        f'(limit {100 * STALLED_SHARE:g} %)'),) if longest else ()
     if len(axle) == 1:
         axle = (*axle, replace(mean_travel(axles[0]), name='mean'))
-    return broken_wheel_reasons(axle, imu, marks)
+    return broken_wheel_reasons(axle, imu, t_stop)
 
 
-def _distances_ahead(axles: list[Axle], imu: ImuRows, marks: tuple[float, float],
+def _distances_ahead(axles: list[Axle], imu: ImuRows, t_stop: float,
                      uncertain_t: Floats) -> list[float]:
-    """Return distances ahead of the axle that steers least, scale units; inf for an axle ()."""
+    """Return distances ahead of the axle that steers least, scale units; inf without wheels."""
     tested = [k for k, axle in enumerate(axles) if axle]
     distances = np.full(len(axles), np.inf)
     if tested:
         first, *others = (mean_travel(axles[k]) for k in tested)
         squares, sigmas = np.transpose([(0.0, 0.0), *(
-            _squared_distance(other, first, imu, marks, uncertain_t) for other in others)])
+            _squared_distance(other, first, imu, t_stop, uncertain_t) for other in others)])
         reference = int(np.argmin(squares))
         square, sigma = squares - squares[reference], np.hypot(sigmas, sigmas[reference])
         distances[tested] = np.where(square > FAULT_SIGMAS * sigma, np.sqrt(square), 0.0)
     return distances.tolist()
 
 
-def _squared_distance(axle: Travel, other: Travel, imu: ImuRows, marks: tuple[float, float],
+def _squared_distance(axle: Travel, other: Travel, imu: ImuRows, t_stop: float,
                       uncertain_t: Floats) -> tuple[float, float]:
     """Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible."""
     # its travel is that of the other axle, the additional path of a steered axle times the squared
     # distance, and the turn
-    pair = wheels_on_grid((axle, other), imu, marks, STEER_GRID, uncertain_t)    # left: axle
+    pair = wheels_on_grid((axle, other), imu, t_stop, STEER_GRID, uncertain_t)    # left: axle
     if pair is None:
         return 0.0, 0.0
     edges = np.arange(0, len(pair.t), CELL_STEPS)

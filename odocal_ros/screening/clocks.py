@@ -119,8 +119,8 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
         return np.interp(seconds(arrival_ns), arrival, lag)
     order = np.argsort(arrival_ns, kind='stable')
     times_ns, lags = arrival_ns[order], np.empty(len(order))
-    for some, rows in enclosing_slices(times_ns, imu.received_ns):
-        lags[order[some]] = np.interp(seconds(times_ns[some]), seconds(imu.received_ns[rows]),
+    for times, rows in enclosing_slices(times_ns, imu.received_ns):
+        lags[order[times]] = np.interp(seconds(times_ns[times]), seconds(imu.received_ns[rows]),
                                       _lag(take(imu, rows)))
     return lags
 
@@ -218,7 +218,7 @@ def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, fl
 
 
 def _chords(position: Floats) -> Floats:
-    """Return distances between sums of positions over adjacent ACCELERATION_S: (n, 1)."""
+    """Return distances between the sums of positions in adjacent windows, as a speed: (n, 1)."""
     cells = round(ACCELERATION_S / OFFSET_CELL)
     total = np.cumsum(np.pad(position, ((cells, cells), (0, 0)), mode='edge'), axis=0)
     window_sum = total[cells:] - total[:-cells]
@@ -226,9 +226,9 @@ def _chords(position: Floats) -> Floats:
     return np.asarray(np.linalg.norm(difference, axis=1, keepdims=True))
 
 
-def _without_slow_changes(x: Floats, slow: float) -> Floats:
-    """Return columns minus their running means over ``slow`` s: (n, k)."""
-    half = min(round(slow / OFFSET_CELL / 2), (len(x) - 1) // 2)
+def _without_slow_changes(x: Floats, window_s: float) -> Floats:
+    """Return columns minus their running means over ``window_s``: (n, k)."""
+    half = min(round(window_s / OFFSET_CELL / 2), (len(x) - 1) // 2)
     total = np.cumsum(np.pad(x, ((half + 1, half), (0, 0)), mode='edge'), axis=0)
     return x - (total[2 * half + 1:] - total[:-2 * half - 1]) / (2 * half + 1)
 
@@ -240,10 +240,10 @@ def _delay(y: Floats, x: Floats, x_delay: float = 0.0) -> float:
     At this delay a regression on x explains the largest share of the variance of y. Rows are
     OFFSET_CELL apart.   x_delay : known delay of x, s, which is added.
     """
-    reach = round(FARTHEST_OFFSET / OFFSET_CELL)
-    size = 2 * max(len(x), reach)
+    max_cells = round(FARTHEST_OFFSET / OFFSET_CELL)
+    size = 2 * max(len(x), max_cells)      # zeros after the rows: the correlation is not cyclic
     product = np.fft.rfft(y, size, axis=0) * np.fft.rfft(x, size, axis=0).conj()
-    cells = np.arange(-reach, reach + 1)      # tested delays
+    cells = np.arange(-max_cells, max_cells + 1)      # tested delays
     correlation = np.fft.irfft(product, axis=0)[cells]
     explained = np.einsum('li,ij,lj->l', correlation, np.linalg.pinv(x.T @ x), correlation) / max(
         float((y**2).sum()), 1e-12)

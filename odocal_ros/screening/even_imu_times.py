@@ -32,10 +32,11 @@ def even_imu_times(t: Floats, w: Floats, f: Floats) -> Floats:
     """Return the sampling times (n,), s, of rows by stamps t; w, f: (n, 3), in any unit."""
     every_100th = t[::100]
     interval = float(np.median(np.diff(every_100th))) / 100 if len(every_100th) > 1 else 0.0
-    per_block = int(BLOCK_TIME / interval) if interval > 0 else 0
-    if per_block < 10 or len(t) < WINDOW_BLOCKS * per_block:
+    block_rows = int(BLOCK_TIME / interval) if interval > 0 else 0
+    if block_rows < 10 or len(t) < WINDOW_BLOCKS * block_rows:
         return t
-    even_times = _EvenTimes(t, interval, per_block)
+    even_times = _EvenTimes(t, interval, block_rows)
+    # (m, 5) tested rows with their neighbours
     tested = np.arange(2, len(t) - 2, max(1, len(t) // TESTED_ROWS))[:, None] + OFFSETS
     stamps, even = t[tested], even_times.times_of(t, tested)
     has_jitter = np.median(np.abs(stamps - even)) > JITTER_SHARE * interval
@@ -47,26 +48,26 @@ class _EvenTimes:
     """
     Even times by the mean stamps of blocks without lost rows; other rows keep their stamps.
 
-    interval : s between rows.   per_block : rows of a block.
-    lost : (b,) bool, blocks with a lost row in them or in an adjacent one.
+    interval : s between rows.   block_rows : rows of a block.
+    has_loss : (b,) bool, blocks with a lost row in them or in an adjacent one.
     knots, lateness : (k,) row numbers, and their time minus row number times interval, s.
     """
 
-    def __init__(self, t: Floats, interval: float, per_block: int) -> None:
-        self.interval, self.per_block = interval, per_block
+    def __init__(self, t: Floats, interval: float, block_rows: int) -> None:
+        self.interval, self.block_rows = interval, block_rows
         lateness = self._mean_lateness(t)
-        self.lost = np.zeros(len(lateness), bool)
+        self.has_loss = np.zeros(len(lateness), bool)
         # a lost row changes the lateness by an interval, across the block that contains it
         jump = np.abs(lateness[2:] - lateness[:-2]) > interval / 2
         for shift in range(3):
-            self.lost[shift:shift + len(jump)] |= jump
-        lines = [self._line(lateness, first, end) for first, end in runs(~self.lost)]
+            self.has_loss[shift:shift + len(jump)] |= jump
+        lines = [self._line(lateness, first, end) for first, end in runs(~self.has_loss)]
         self.knots, self.lateness = np.concatenate([np.zeros((2, 0)), *lines], axis=1)
 
     def _mean_lateness(self, t: Floats) -> Floats:
         """Return the trimmed mean of stamp minus row number times interval, of each block, s."""
-        n, blocks, means = self.per_block, len(t) // self.per_block, []
-        for chunk in np.array_split(np.arange(blocks), 1 + len(t) // CHUNK_ROWS):
+        n, means = self.block_rows, []
+        for chunk in np.array_split(np.arange(len(t) // n), 1 + len(t) // CHUNK_ROWS):
             rows = np.arange(chunk[0] * n, (chunk[-1] + 1) * n)
             lateness = np.sort((t[rows] - self.interval * rows).reshape(-1, n), axis=1)
             means.append(lateness[:, n // 10:n - n // 10].mean(axis=1))
@@ -75,14 +76,14 @@ class _EvenTimes:
     def _line(self, lateness: Floats, first: int, end: int) -> Floats:
         """Return knots and lateness of blocks without a loss: a line plus means of windows."""
         blocks = np.arange(first, end)
-        middle = (blocks + 0.5) * self.per_block
+        middle = (blocks + 0.5) * self.block_rows
         slope, start = np.polyfit(middle, lateness[first:end], 1) if len(blocks) > 1 \
             else (0.0, lateness[first])
         residual = lateness[first:end] - start - slope * middle
         windows = np.array_split(blocks - first, max(1, len(blocks) // WINDOW_BLOCKS))
         means = np.array([residual[window].mean() for window in windows])
-        knots = np.array([first * self.per_block, *(middle[window].mean() for window in windows),
-                          end * self.per_block - 1])
+        knots = np.array([first * self.block_rows, *(middle[window].mean() for window in windows),
+                          end * self.block_rows - 1])
         return np.stack([knots, start + slope * knots + np.pad(means, 1, mode='edge')])
 
     def times_of(self, t: Floats, rows: Ints) -> Floats:
@@ -90,8 +91,8 @@ class _EvenTimes:
         if not len(self.knots):
             return t[rows]
         even = self.interval * rows + np.interp(rows, self.knots, self.lateness)
-        lost = self.lost[np.minimum(rows // self.per_block, len(self.lost) - 1)]
-        return np.where(lost, t[rows], even)
+        has_loss = self.has_loss[np.minimum(rows // self.block_rows, len(self.has_loss) - 1)]
+        return np.where(has_loss, t[rows], even)
 
     def all_times(self, t: Floats) -> Floats:
         """Return the times of all rows with stamps t, strictly rising: (n,) s."""

@@ -4,21 +4,18 @@
 """
 Selection of usable fixes and GNSS velocities, and the uncertainty of each fix.
 
-Some receivers dead-reckon without satellites, and their position jumps when satellites return.
-Such fixes are smooth: the change of their displacement from second to second agrees with odometer
-and IMU far better than elsewhere. The jump at the end is the sum of their errors, so these fixes
-contain no information on the scale.
+In: fixes and velocities as received. Out: masks, covariances, and reasons for unused ones.
 """
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints, running_sum
+from odocal_ros.data.arrays import Bools, Floats, running_sum
 from odocal_ros.data.samples import FixSamples, LOCAL_STATUS
 from odocal_ros.nav.geodesy import ecef_from_geodetic, radii
-from odocal_ros.nav.time_series import MISSING_INTERVALS, running_integral
+from odocal_ros.nav.time_series import running_integral
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import GnssConfig
-from odocal_ros.settings.levels import REMARK_SIGMAS
+from odocal_ros.settings.levels import FIX_NOISE_LIMIT, REMARK_SIGMAS
 
 # m, judgement. Measured on eight zoo drives with blocks of fixes of 7 m among fixes of 0.01 to
 # 1.5 m: without a limit the sigma of the scale is 1.2 to 24 times as large, as correlated errors
@@ -30,28 +27,19 @@ VELOCITY_GAP = 2.0    # s, judgement: a longer one hides a change of speed
 # of |z - 1| in velocity_reasons. Judgement: velocities and fixes differ by a few per cent, by
 # far more with wrong axes, units and frames
 VELOCITY_RATIO_LIMIT = 0.1
-COMPARISON_INTERVAL = 1.0     # s between the fixes that are compared: judgement
-MIN_DISPLACEMENT = 1.0      # m in this time, judgement: displacements then have a direction
-# judgement: a displacement is smooth if its deviation from odometer and gyro is below a quarter of
-# the median deviation, or below half of it and 3 cm, the noise of odometer and gyro
-SMOOTH_LIMIT, FINE_SHARE, FINE_LIMIT = 0.25, 0.5, 0.03
-# judgement: compared fixes of a smooth section, and smooth share of them; white noise reaches it
-# three times in 10^8 (a quarter), or in 10^4 (half)
-SMOOTH_ROWS, SMOOTH_SHARE = 10, 0.7
-# least deviation of a jump, in medians and m. Judgement: white noise exceeds three medians once in
-# 500 seconds, after a smooth section
-JUMP_SIZE, SHORTEST_JUMP = 3.0, 0.5
-# s, physical: in 0.1 s a change of acceleration by 5 m/s^2 (hard braking) gives SHORTEST_JUMP
-JUMP_DELAY = 0.1
-SPANS_LISTED = 3           # judgement: number of spans in a reason
+FINEST_ANGLE = 1e-10    # rad, physical: 0.6 mm: finer steps have no effect
+# statistical: least number of differences of coordinates; those of unrounded values are all
+# multiples of one step once in 10^9
+MIN_DIFFERENCES = 10
+OFF_GRID = 0.02         # judgement: limit of the deviation from a multiple of a step, in steps
 
 
-def usable_fixes(fix: FixSamples, received: int, gnss: GnssConfig,
-                 origin: str = '') -> tuple[Bools, Floats, tuple[Reason, ...]]:
+def usable_fixes(fix: FixSamples, received_count: int, gnss: GnssConfig,
+                 scope_text: str = '') -> tuple[Bools, Floats, tuple[Reason, ...]]:
     """
-    Return usable fixes, (n,) bool, covariances, (n, 3, 3) m^2, and reasons.
+    Return a mask of usable fixes, (n,) bool, covariances, (n, 3, 3) m^2, and reasons.
 
-    received : number of received fixes.   origin : text that follows this number.
+    scope_text : which fixes ``received_count`` includes, in the reason.
     """
     no_fix = fix.status < gnss.min_status
     max_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
@@ -61,14 +49,14 @@ def usable_fixes(fix: FixSamples, received: int, gnss: GnssConfig,
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
     limit = sigma_limit(sigma[~unknown & ~no_fix & ~invalid], gnss.max_sigma)
     inaccurate = (sigma > limit) & ~unknown
-    use = ~(no_fix | invalid | inaccurate)
+    usable = ~(no_fix | invalid | inaccurate)
     reasons: tuple[Reason, ...] = ()
     if (unknown & ~no_fix).any():
         local = bool((fix.status == LOCAL_STATUS).any())
         name = 'reference.default_sigma' if local else 'gnss.default_sigma'
         reasons += (Reason(
-            Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {received} fixes have '
-            f'no usable covariance; {gnss.default_sigma:g} m ({name}) is used',
+            Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {received_count} fixes '
+            f'have no usable covariance; {gnss.default_sigma:g} m ({name}) is used',
             f'Set {name} to the real horizontal accuracy of the positions.' if local else ''),)
     rejected = [(f'{int(mask.sum())} {cause}', remedy) for mask, cause, remedy in (
         (no_fix, f'with status below {gnss.min_status}', 'Drive under open sky, or lower '
@@ -80,11 +68,12 @@ def usable_fixes(fix: FixSamples, received: int, gnss: GnssConfig,
          'uncertainties are correct, raise gnss.max_sigma (0: no limit): each fix is weighted by '
          'its own uncertainty.')) if mask.any()]
     if rejected:
-        code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
+        code = Code.BAD_ROWS_DROPPED if usable.any() else Code.FIXES_UNUSABLE
         causes, remedies = zip(*rejected, strict=True)
-        reasons += (Reason(code, f'{int((~use).sum())} of {received} fixes{origin} are not used: '
-                           f'{", ".join(causes)}', ' '.join(remedies)),)
-    return use, covariance, reasons
+        reasons += (Reason(code, f'{int((~usable).sum())} of {received_count} '
+                           f'fixes{scope_text} are not used: {", ".join(causes)}',
+                           ' '.join(remedies)),)
+    return usable, covariance, reasons
 
 
 def _invalid_text(fix: FixSamples, invalid: Bools) -> str:
@@ -202,95 +191,54 @@ def velocity_reasons(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Flo
                    'unit, swapped axes, or vehicle axes'),)
 
 
-def dead_reckoned_fixes(t_fix: Floats, fixes_n: Floats, sigma: Floats,
-                        track: Complexes) -> tuple[Bools, tuple[Reason, ...]]:
+def rounding_variance(geodetic: Floats, covariance_n: Floats) -> tuple[Floats, tuple[Reason, ...]]:
     """
-    Return a mask of fixes that a receiver has dead-reckoned, and FIXES_DEAD_RECKONED.
+    Return the variances by rounding, (n, 3) m^2, and FIXES_NOISIER_THAN_SAID if they are large.
 
-    t_fix : (k,) s.   fixes_n : (k, 3) m.   sigma : (k,) stated, of an axis, m.   track : (k,)
-    positions of the antenna by odometer and gyro, m, with any first heading, scale within 30 %.
+    A coordinate that is equal in m consecutive fixes has one error, uniform in its step, which
+    their mean does not reduce: each has m times its variance.
+
+    geodetic : (n, 3) latitude and longitude, rad, height, in order of time.   covariance_n : (n,
+    3, 3) stated, m^2.
     """
-    spans = _dead_reckoned_spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, track)
-    is_reckoned = np.zeros(len(t_fix), bool)
-    for begin, end, _ in spans:
-        is_reckoned |= (t_fix >= begin) & (t_fix < end)
-    if not spans:
-        return is_reckoned, ()
-    listed = ', '.join(f't = {begin:.0f} to {t_fix[t_fix < end][-1]:.0f} s (jump of {jump:.1f} m)'
-                       for begin, end, jump in spans[:SPANS_LISTED])
-    more = f' and {len(spans) - SPANS_LISTED} more' * (len(spans) > SPANS_LISTED)
-    return is_reckoned, (Reason(
-        Code.FIXES_DEAD_RECKONED, f'fixes were dead-reckoned at {listed}{more}: '
-        f'{int(is_reckoned.sum())} of {len(t_fix)} fixes not used'),)
+    n = len(geodetic)
+    variance = np.zeros((n, 3))
+    angles = geodetic[:, 1::-1]     # along east and north
+    steps = np.array([common_step(angle) for angle in angles.T])
+    if not steps.any():
+        return variance, ()
+    # a coordinate that hardly changes has too few differences
+    steps[steps == 0] = steps.max()
+    latitude = float(np.median(geodetic[:, 0]))
+    meridian, normal = radii(latitude)
+    sizes = steps * (normal * np.cos(latitude), meridian)
+    for axis, coordinate in enumerate(np.rint((angles - angles[0]) / steps).T):     # in steps
+        first_equal = np.flatnonzero(np.diff(coordinate, prepend=np.nan))
+        count = np.diff(first_equal, append=n)      # of consecutive fixes with equal coordinates
+        variance[:, axis] = np.repeat(count, count) * sizes[axis]**2 / 12
+    stated = np.sqrt(np.median(covariance_n.diagonal(axis1=1, axis2=2), axis=0)[:2])
+    factor = float(np.hypot(1.0, sizes / np.sqrt(12) / stated).max())
+    if factor <= FIX_NOISE_LIMIT:
+        return variance, ()
+    east, north = sizes
+    return variance, (Reason(
+        Code.FIXES_NOISIER_THAN_SAID, f'positions are rounded to {east:.2g} m east and '
+        f'{north:.2g} m north: fix errors are {factor:.1f} times as large as their covariance '
+        f'states (limit {FIX_NOISE_LIMIT:g}); accounted for', 'Publish latitude and longitude '
+        'as double, unrounded or with at least 8 decimals of a degree (NMEA: 6 of a minute).'),)
 
 
-def _dead_reckoned_spans(t: Floats, positions: Complexes, sigma: Floats,
-                         track: Complexes) -> list[tuple[float, float, float]]:
-    """Return for each span its first fix and the first after it, s, and the jump there, m."""
-    if len(t) <= SMOOTH_ROWS:
-        return []
-    step = min(max(1, round(COMPARISON_INTERVAL / float(np.median(np.diff(t))))), len(t) - 1)
-    t, positions, sigma, track = t[::step], positions[::step], sigma[::step], track[::step]
-    rows, deviation, in_motion = _deviations(t, np.diff(positions), np.diff(track))
-    if not len(rows):
-        return []
-    usual, driven_rows = float(np.median(deviation[in_motion])), rows[in_motion]
-    smooth = deviation[in_motion] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
-    spans: list[tuple[float, float, float]] = []
-    # jumps below the stated error are caused by changes of satellites
-    jump_limit = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[rows])
-    for k in np.flatnonzero(deviation > jump_limit):
-        last = int(np.searchsorted(driven_rows, rows[k]))
-        first = _smooth_begin(smooth[:last])
-        if first == last:
-            continue
-        # fixes since the previous compared one may be dead-reckoned too
-        begin = float(t[max(driven_rows[first] - 2, 0)])
-        # the row after a jump has the same deviation
-        if not spans or begin > spans[-1][1]:
-            spans.append((begin, float(t[rows[k] + 1]), float(deviation[k])))
-    return spans
-
-
-def _deviations(t: Floats, fix_steps: Complexes,
-                track_steps: Complexes) -> tuple[Ints, Floats, Bools]:
-    """
-    Return rows of fix_steps, their deviations, m, and True if they and the rows before are moving.
-
-    t : (k,) s.   fix_steps, track_steps : (k - 1,) displacements by fixes and by the track, m. The
-    ratio of the two, a scale and a rotation, should be that of the last row in motion before,
-    which may not be adjacent: a jump may come at a standstill. Empty with too few rows in motion.
-    """
-    dt = np.diff(t)
-    complete = dt < MISSING_INTERVALS * np.median(dt)
-    moving = complete & (np.abs(track_steps) > MIN_DISPLACEMENT)
-    before = np.maximum.accumulate(np.where(moving, np.arange(len(track_steps)), -1))[:-1]
-    rows = np.flatnonzero(complete[1:] & (before >= 0)) + 1
-    before = before[rows - 1]
-    in_motion = moving[rows] & (before == rows - 1)
-    if in_motion.sum() <= SMOOTH_ROWS:
-        return rows[:0], np.empty(0), in_motion[:0]
-    ratio = fix_steps[before] / track_steps[before]
-    acceleration = np.gradient(track_steps) / np.median(dt)
-    change = acceleration[rows] - acceleration[before] * track_steps[rows] / track_steps[before]
-    deviation = _without_delay(fix_steps[rows] - ratio * track_steps[rows], ratio * change)
-    return rows, deviation, in_motion
-
-
-def _without_delay(deviation: Complexes, delay_rate: Complexes) -> Floats:
-    """Return sizes of deviations, (n,) m, without the part by a common delay; delay_rate: m/s."""
-    size = np.maximum(np.abs(delay_rate), 1e-9)
-    delays = (deviation * delay_rate.conj()).real / size**2
-    order = np.argsort(delays)
-    weight = np.cumsum(size[order])
-    delay = delays[order[np.searchsorted(weight, weight[-1] / 2)]]    # weighted median
-    return np.asarray(np.abs(deviation - delay * delay_rate * (abs(delay) > JUMP_DELAY)))
-
-
-def _smooth_begin(smooth: Bools) -> int:
-    """Return the first row of the smooth section at the end, or the length if there is none."""
-    begin = len(smooth)
-    while begin >= SMOOTH_ROWS and smooth[begin - SMOOTH_ROWS:begin].mean() >= SMOOTH_SHARE:
-        begin -= 1
-    return begin if begin == len(smooth) else begin - SMOOTH_ROWS + 1 + int(
-        np.argmax(smooth[begin - SMOOTH_ROWS + 1:]))
+def common_step(angle: Floats) -> float:
+    """Return the greatest common divisor of differences of angles, (n,) rad; 0: none (Euclid)."""
+    differences = np.diff(np.unique(angle))
+    differences = differences[differences > FINEST_ANGLE]
+    if len(differences) < MIN_DIFFERENCES:
+        return 0.0
+    step = float(differences.min())
+    while step > FINEST_ANGLE:
+        remainder = abs(differences - step * np.rint(differences / step))
+        remainder = remainder[remainder > OFF_GRID * step]
+        if not len(remainder):
+            return step
+        step = float(remainder.min())
+    return 0.0

@@ -4,7 +4,8 @@
 """
 Detection of values that are no measurements: impossible, isolated, frozen, or saturated.
 
-A glitch is a spike (a jump away and back, in motion too) or an isolated outlier (without motion).
+In: raw columns of a topic. Out: masks of rows, or reasons. A glitch is a spike (a jump away and
+back, in motion too) or an isolated outlier (without motion).
 """
 
 from dataclasses import replace
@@ -127,7 +128,7 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
     if not len(large):
         return is_spike
     jumps = large[steps[large] > USUAL_STEPS * median(steps)]
-    end = -1
+    end = -1      # of the last spike
     max_jumps = 2000    # jumps that are tested
     for row in jumps[:max_jumps]:
         if row < end:
@@ -197,22 +198,23 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()
-    same = map_windows(lambda w: reduce_columns(np.logical_and, w[1:] == w[:-1])
-                   & reduce_columns(np.logical_or, w[1:] != 0), w)
-    repeats = runs(same)
-    begin, end = t[repeats].T
+    repeats = map_windows(lambda w: reduce_columns(np.logical_and, w[1:] == w[:-1])
+                          & reduce_columns(np.logical_or, w[1:] != 0), w)
+    spans = runs(repeats)
+    begin, end = t[spans].T
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)
-    rolled = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)
+    mean_speed = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)
     frozen = np.flatnonzero((end - begin > limit)
-                            & (rolled > ROLLING_SHARE * np.percentile(speed, 95)))
-    frozen_rows = np.diff(repeats[frozen]).sum()
+                            & (mean_speed > ROLLING_SHARE * np.percentile(speed, 95)))
+    frozen_rows = np.diff(spans[frozen]).sum()
     coarse_share = 0.2      # judgement: share of the other rows; fine gyros have no repeats
-    if not len(frozen) or same.sum() - frozen_rows > coarse_share * (len(same) - frozen_rows):
+    if not len(frozen) or (
+            repeats.sum() - frozen_rows > coarse_share * (len(repeats) - frozen_rows)):
         return ()
-    worst = frozen[np.argmax((end - begin)[frozen])]
+    longest = frozen[np.argmax((end - begin)[frozen])]
     return (Reason(Code.IMU_GAP, 'the gyro repeats one value for '
-                   f'{end[worst] - begin[worst]:.2f} s at t = {begin[worst]:.2f} s while the '
-                   'wheels turn: its output is frozen'),)
+                   f'{end[longest] - begin[longest]:.2f} s at t = {begin[longest]:.2f} s while '
+                   f'the wheels turn (limit {limit:g} s): its output is frozen'),)
 
 
 def dead_band_reasons(t: Floats, w: Floats, travel: Travel) -> tuple[Reason, ...]:
@@ -224,19 +226,19 @@ def dead_band_reasons(t: Floats, w: Floats, travel: Travel) -> tuple[Reason, ...
     if len(t) < 2 or len(travel.t) < 2:
         return ()
     t, w = thinned(t, DEAD_BAND_ROWS), thinned(w, DEAD_BAND_ROWS)
-    second = np.arange(t[0], t[-1] + 1.0)
-    speed = np.abs(np.diff(travel.at(second), append=travel.s[-1]))
-    rolls = np.interp(t, second + 0.5, speed) > ROLLING_SHARE * np.percentile(speed, 95)
-    found = []
-    for axis, x in zip('xyz', np.abs(w[rolls]).T, strict=True):
+    seconds = np.arange(t[0], t[-1] + 1.0)
+    speed = np.abs(np.diff(travel.at(seconds), append=travel.s[-1]))
+    in_motion = np.interp(t, seconds + 0.5, speed) > ROLLING_SHARE * np.percentile(speed, 95)
+    dead_bands = []      # share of zeros, axis, smallest rate, deg/s
+    for axis, x in zip('xyz', np.abs(w[in_motion]).T, strict=True):
         smallest = np.min(x, where=x > 0, initial=np.inf)
         zeros = float((x == 0).mean()) if len(x) else 0.0
         next_rates = np.unique(np.round(x[(x > 0) & (x < 2 * smallest)] / smallest, 2))
         if zeros > ZERO_SHARE and len(next_rates) >= MIN_NEXT_RATES:
-            found.append((zeros, axis, np.rad2deg(smallest)))
-    if not found:
+            dead_bands.append((zeros, axis, np.rad2deg(smallest)))
+    if not dead_bands:
         return ()
-    zeros, axis, limit_deg = max(found)
+    zeros, axis, limit_deg = max(dead_bands)
     return (Reason(Code.GYRO_DEAD_BAND, f'the gyro sends 0 for turn rates below {limit_deg:.2g} '
                    f'deg/s, axis {axis} in {100 * zeros:.0f} % of the messages in motion'),)
 
@@ -244,7 +246,7 @@ def dead_band_reasons(t: Floats, w: Floats, travel: Travel) -> tuple[Reason, ...
 def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
                        imu: ImuConfig) -> tuple[Reason, ...]:
     """Return IMU_SATURATED for the axis of (n, 3) raw rates or forces most often at its limit."""
-    saturated = []
+    saturated = []      # rows at the limit, time of the first, s, text
     for sensor, x_i, scale, unit, min_limit in (
             ('gyro', w_i, imu.gyro_scale, 'rad/s', MIN_GYRO_RANGE),
             ('accelerometer', f_i, imu.accel_scale, 'm/s^2', MIN_ACCELEROMETER_RANGE)):

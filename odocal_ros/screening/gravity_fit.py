@@ -72,15 +72,15 @@ def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
     if len(edges) <= SHORTEST_S * ROWS_A_SECOND:
         return None
     count, (w, f) = bin_means(t, edges, w, f)
-    full = count > 0
-    if not full.any():
+    has_rows = count > 0
+    if not has_rows.any():
         return None
-    w = np.where(full[:, None], w - np.median(w[full], axis=0), 0.0)
-    f = np.where(full[:, None], f, np.median(f[full], axis=0))
-    return _fit(*_segments(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit, full))
+    w = np.where(has_rows[:, None], w - np.median(w[has_rows], axis=0), 0.0)
+    f = np.where(has_rows[:, None], f, np.median(f[has_rows], axis=0))
+    return _fit(*_segments(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit, has_rows))
 
 
-def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, Complexes]:
+def _segments(w: Floats, f: Floats, s: Floats, has_rows: Bools) -> tuple[Complexes, Complexes]:
     """
     Return regressors, (k, m, 9), and forces, (k, m), m/s^2, of k segments of m seconds.
 
@@ -88,7 +88,7 @@ def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, 
     each segment are removed from both.
 
     w, f : (n, 3) rad/s, m/s^2, in rows of ROW_S, along e1, e2, up.   s : (n + 1,) m, travel at
-    their edges.   full : (n,) True if the IMU has samples there.
+    their edges.   has_rows : (n,) True if the IMU has samples there.
     """
     half = ROWS_A_SECOND // 2
     speed = np.zeros(len(s))
@@ -97,7 +97,7 @@ def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, 
     driven_s = np.count_nonzero(np.abs(speed) > MOVING_SPEED)
     length = int(np.clip(driven_s // SEGMENTS, SHORTEST_S, LONGEST_S))
 
-    def cut(x: NDArray[Any]) -> NDArray[Any]:
+    def cut(x: NDArray[Any]) -> NDArray[Any]:      # into segments
         k = len(x) // length
         return x[:k * length].reshape(k, length, *x.shape[1:])
     psi = running_sum(w[:, 2]) * ROW_S
@@ -114,8 +114,9 @@ def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, 
                      np.gradient(turn_rate) * heading, turn_rate**2 * heading]
     regressors = cut(np.stack([*tilts, *accelerations], -1))
     offsets = cut(np.stack([np.ones_like(bias_tilt), bias_tilt], -1))
+    # orthonormal: constant, and tilt by the gyro bias minus its mean
     basis, _ = np.linalg.qr(offsets - [0.0, 1.0] * offsets.mean(1, keepdims=True))
-    use = cut(_means_of_seconds(full) == 1).all(axis=1) & (
+    use = cut(_means_of_seconds(has_rows) == 1).all(axis=1) & (
         np.abs(cut((speed[1:] + speed[:-1]) / 2)).mean(axis=1) > MOVING_SPEED)
 
     def without_offsets(x: Complexes) -> Complexes:

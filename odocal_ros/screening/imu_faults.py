@@ -98,7 +98,8 @@ def forward_turn_reasons(binned: Accelerations | None) -> tuple[Reason, ...]:
     if binned is None:
         return ()
     edges = np.linspace(0, len(binned.t), 11).astype(int)
-    turns = []      # sigma and angle, deg, begin and end, s
+    # sigma and angle, deg, begin and end, s; forward turns in the IMU opposite to the yaw mounting
+    turns = []
     for begin, end in zip(edges[1:-2], edges[2:-1], strict=True):
         before, after = orientation_of(binned[:begin]), orientation_of(binned[end:])
         if before is None or after is None:
@@ -119,9 +120,9 @@ def _imu_moved_reason(observation: str, begin: float, end: float) -> Reason:
                   f'{end:.0f} s: the IMU was moved in the vehicle', REMEDY)
 
 
-def _angle_between(one: Floats, other: Floats) -> float:
+def _angle_between(first: Floats, second: Floats) -> float:
     """Return the angle between two vectors, (3,), deg; 0 if one is zero."""
-    sine, cosine = np.linalg.norm(np.cross(one, other)), float(one @ other)
+    sine, cosine = np.linalg.norm(np.cross(first, second)), float(first @ second)
     return float(np.rad2deg(np.arctan2(sine, cosine)))
 
 
@@ -174,24 +175,34 @@ def _share_of_second_imu(x: Floats) -> float:
     blocks = odd_minus_even[:count * MEAN_ROWS].reshape(count, MEAN_ROWS, 3)
     difference = blocks.mean(axis=1)
     size = np.abs(difference).max(axis=1)
-    usual = size <= OUTLIER_RATIO * np.median(size)
-    mean = x[1:count * MEAN_ROWS + 1].reshape(blocks.shape).mean(axis=1)[usual]
+    is_usual = size <= OUTLIER_RATIO * np.median(size)
+    mean = x[1:count * MEAN_ROWS + 1].reshape(blocks.shape).mean(axis=1)[is_usual]
     # scale blocks to equal noise: one that tilts and vibrates more would dominate the fit
-    blocks, design = blocks[usual], np.column_stack([np.ones(len(mean)), mean])
+    blocks, design = blocks[is_usual], np.column_stack([np.ones(len(mean)), mean])
     noise = np.sqrt((blocks**2).mean(axis=(1, 2)))
     noise = np.maximum(noise, np.median(noise) or 1.0)[:, None]
-    difference, design = difference[usual] / noise, design / noise
-    blocks = blocks / noise[:, None]
+    difference, design = difference[is_usual] / noise, design / noise
+    return _significant_share(difference, design, ((blocks / noise[:, None])**2).mean(axis=(0, 1)))
+
+
+def _significant_share(difference: Floats, design: Floats, power: Floats) -> float:
+    """
+    Return the largest share of the variance of an axis that a regression explains; 0: by chance.
+
+    difference, design : (m, 3), (m, k) means of blocks, and regressors.   power : (3,) mean square
+    of single rows.
+    """
     freedom = len(difference) - design.shape[1]
     if freedom < MIN_MEANS // 2:
         return 0.0
     residual = difference - design @ np.linalg.lstsq(design, difference, rcond=None)[0]
     unexplained, total = (residual**2).sum(axis=0), (difference**2).sum(axis=0)
     lagged = (residual[1:] * residual[:-1]).sum(axis=0)
-    explained, power = total - unexplained, (blocks**2).mean(axis=(0, 1))
+    explained = total - unexplained
     significant = (explained * freedom > MIN_F_STATISTIC * design.shape[1] * unexplained) & (
         explained / len(difference) > MIN_EXPLAINED_VARIANCE * power / MEAN_ROWS)
-    vibrating = lagged > np.maximum(CORRELATION_LIMIT * unexplained, SLOW_SHARE_LIMIT * explained)
-    if vibrating[np.argmax(explained / np.maximum(power, 1e-300))]:
+    is_vibration = lagged > np.maximum(CORRELATION_LIMIT * unexplained,
+                                       SLOW_SHARE_LIMIT * explained)
+    if is_vibration[np.argmax(explained / np.maximum(power, 1e-300))]:
         return 0.0
     return float((explained[significant] / total[significant]).max(initial=0.0))

@@ -90,17 +90,16 @@ def bin_accelerations(t: Floats, w: Floats, f: Floats, up: Floats, travel: Trave
     e1 = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(up, e1)
-    full = np.flatnonzero(count)      # bins with rows
-    return Accelerations(e1, e2, middle[full], (f @ e1 + 1j * (f @ e2))[full], forward[full],
-                         (speed * turn_rate)[full])
+    filled = np.flatnonzero(count)      # bins with rows
+    return Accelerations(e1, e2, middle[filled], (f @ e1 + 1j * (f @ e2))[filled],
+                         forward[filled], (speed * turn_rate)[filled])
 
 
 def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | None:
     """Return the changes of the accelerations of a leg, None if it is too short."""
-    mean = inputs.median_f_b
-    size = float(np.linalg.norm(mean))
-    binned = bin_accelerations(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,
-                               metres_per_unit) if size else None
+    up_b = inputs.up_b
+    binned = bin_accelerations(inputs.t_imu, inputs.w_b, inputs.f_b, up_b, inputs.travel,
+                               metres_per_unit) if up_b.any() else None
     return None if binned is None else binned.changes()
 
 

@@ -39,14 +39,6 @@ class Rhythm(NamedTuple):
     t: Floats           # (n,) s
 
 
-class LateRun(NamedTuple):
-    """Adjacent late rows."""
-
-    begin: int            # first row
-    end: int              # row after the last one
-    fits_rhythm: bool     # travel is smooth at the times of the rhythm
-
-
 def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm,
                    name: str = 'odometer') -> tuple[Floats, list[Reason]]:
     """Return the sampling times, (n,) s, of rows stamped at t, and the reason if rows are late."""
@@ -109,8 +101,10 @@ def _correct_bursts(t: Floats, travel: Floats, rounding: float) -> Floats:
     late = t - rhythm.t > (rhythm.interval if is_smoother else
                            max(min_delay, delay_share * rhythm.interval))
     sampled = (rhythm.t if is_smoother else t).copy()
-    for begin, end, fits_rhythm in _late_runs(t, rhythm.t, travel, late, rounding):
-        if fits_rhythm:
+    spans = runs(late)
+    fits_rhythm = _fit_rhythm(spans, t, rhythm.t, travel, late, rounding)
+    for (begin, end), fits in zip(spans.tolist(), fits_rhythm.tolist(), strict=True):
+        if fits:
             sampled[begin:end] = rhythm.t[begin:end]
         elif begin > 0 and end < len(t):
             sampled[begin:end] = _times_by_travel(t, travel, begin - 1, end, rhythm.interval)
@@ -123,12 +117,12 @@ def _rising(t: Floats) -> Floats:
     return np.asarray(np.maximum.accumulate(t - order) + order)
 
 
-def _late_runs(t: Floats, even: Floats, travel: Floats, late: Bools,
-               rounding: float) -> list[LateRun]:
-    """Return the runs of late rows, (n,) bool; even : (n,) s, the times of the rhythm."""
-    begin, end = runs(late).T
+def _fit_rhythm(spans: Ints, t: Floats, even: Floats, travel: Floats, late: Bools,
+                rounding: float) -> Bools:
+    """Return True for each span of late rows, (k, 2), in which travel fits even times, (n,) s."""
+    begin, end = spans.T
     if not len(begin):
-        return []
+        return np.zeros(0, bool)
     low, high = np.maximum(begin - NODE_STEP, 0), np.minimum(end + NODE_STEP, len(t))
     tested = np.zeros(len(t) + 1, bool)
     for shift in range(-NODE_STEP, NODE_STEP + 1):
@@ -141,8 +135,7 @@ def _late_runs(t: Floats, even: Floats, travel: Floats, late: Bools,
     at_stamps, at_even = np.sqrt(np.add.reduceat(deviation**2, ends, axis=1)[:, ::2])
     largest = np.maximum.reduceat(np.abs(deviation[1]), ends)[::2]
     fitting_share = 0.25    # of the deviation at the stamps: more remains if a row is lost
-    fits = (largest <= rounding) | (at_even < fitting_share * at_stamps)
-    return list(map(LateRun, begin.tolist(), end.tolist(), fits.tolist()))
+    return np.asarray((largest <= rounding) | (at_even < fitting_share * at_stamps))
 
 
 def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[Rhythm, bool]:

@@ -90,18 +90,18 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
     if not is_local(leg.fix):
         return leg, ()
-    left_out = ['GNSS velocities'] * bool(len(leg.rows('fix_velocity').stamp_ns))
+    unused = ['GNSS velocities'] * bool(len(leg.rows('fix_velocity').stamp_ns))
     leg = leg.with_rows(fix_velocity=samples.VelocitySamples.empty())
     if config.alignment.heading_source == 'auto' and len(leg.rows('heading').stamp_ns):
-        left_out += ['external headings']
+        unused += ['external headings']
         leg = leg.with_rows(heading=samples.HeadingSamples.empty())
     latitude = math.radians(config.reference.latitude_deg)
     earth_rate = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
     text = ('positions are in a local frame, so north is unknown: up to '
             f'{math.degrees(earth_rate) * 3600:.1f} deg/h of the Earth rate are estimated as gyro '
             'bias')
-    if left_out:
-        text += f'; {" and ".join(left_out)} are not used'
+    if unused:
+        text += f'; {" and ".join(unused)} are not used'
     reason = Reason(Code.LOCAL_FRAME, text)
     if not np.isnan(leg.fix.latitude).all():
         return leg, (reason,)

@@ -18,6 +18,7 @@ from odocal_ros.data.arrays import Floats, Ints, runs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import double_integral_at, integral_at
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.inputs import ImuRows
 from odocal_ros.settings.levels import FAULT_SIGMAS
 from odocal_ros.settings.nominal import G
 
@@ -28,27 +29,25 @@ BY_IMU = 'the acceleration has the opposite sign of the other starts'
 BY_FIT = 'IMU and fixes move backwards'
 
 
-def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
-                    marks: tuple[float, float]) -> Floats:
+def reversed_starts(travel: Travel, imu: ImuRows, t_stop: float) -> Floats:
     """
     Return begin and end of reversing in which the counter counts up: (m, 2) s.
 
-    travel : of the odometer, any unit.   t_imu, w_b, f_b : (n,), (n, 3), (n, 3) s, turn rate with
-    bias, rad/s, specific force, m/s^2.   marks : start and stop, s; starts before them only
-    contribute to the usual ratio. The result is empty if travel counts down in reverse, or if the
-    IMU's x axis points across the vehicle.
+    travel : in any unit.   t_stop : s, stop mark. Motion before the start mark only contributes to
+    the usual ratio. The result is empty if travel counts down in reverse, or if the IMU's x axis
+    points across the vehicle.
     """
     no_spans = np.empty((0, 2))
-    if len(travel.t) < 3 or len(t_imu) < 3:
+    if len(travel.t) < 3 or len(imu.t) < 3:
         return no_spans
-    t = np.arange(max(travel.t[0], t_imu[0]) + ACCELERATION_TIME,
-                  min(travel.t[-1], t_imu[-1]) - ACCELERATION_TIME, REVERSING_STEP)
+    t = np.arange(max(travel.t[0], imu.t[0]) + ACCELERATION_TIME,
+                  min(travel.t[-1], imu.t[-1]) - ACCELERATION_TIME, REVERSING_STEP)
     if len(t) < 2 * (STOP_TIME + ACCELERATION_TIME) / REVERSING_STEP:
         return no_spans
     begins, ends = _sections_between_stops(t, travel)
     if len(begins) < 2:
         return no_spans
-    force = _Forces(t, t_imu, w_b, f_b)
+    force = _Forces(t, imu)
     before, middle, after = (
         travel.at(t + delay) for delay in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME))
     acceleration = (before - 2 * middle + after) / ACCELERATION_TIME**2
@@ -57,14 +56,14 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     path = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
     significant = np.abs(ratio) > FAULT_SIGMAS * sigma
     forward_sign = np.sign((path * np.sign(ratio))[significant].sum())
-    usual = significant & (np.sign(ratio) == forward_sign)
-    if not forward_sign or not usual.any():
+    is_forward = significant & (np.sign(ratio) == forward_sign)
+    if not forward_sign or not is_forward.any():
         return no_spans
-    usual_ratio = np.median(np.abs(ratio[usual]))
+    usual_ratio = np.median(np.abs(ratio[is_forward]))
     lowest, highest = 0.5, 2.0    # ratio of a reversed start over the usual one
-    is_reversed = significant & ~usual & (np.abs(ratio) > lowest * usual_ratio) & (
+    is_reversed = significant & ~is_forward & (np.abs(ratio) > lowest * usual_ratio) & (
         np.abs(ratio) < highest * usual_ratio)
-    is_reversed &= (t[ends] > marks[0]) & (t[begins] < marks[1])
+    is_reversed &= (t[ends] > 0.0) & (t[begins] < t_stop)
     # at the last step of the grid the vehicle still moves
     return np.stack([t[begins[is_reversed]] - ACCELERATION_TIME,
                      t[ends[is_reversed]] + ACCELERATION_TIME], -1)
@@ -87,9 +86,9 @@ def sections_slipped_twice(slips: Sequence[dict[str, Any]], travel: Travel,
     path = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
     middle = np.array([slip['t'] + slip['duration'] / 2 for slip in slips])
     size = np.array([slip['metres'] for slip in slips])
-    slipped = np.array([size[(middle > begin) & (middle < end)].sum() for begin, end in spans])
+    slip = np.array([size[(middle > begin) & (middle < end)].sum() for begin, end in spans])    # m
     min_path = 1.0    # m
-    share = slipped / np.maximum(2 * path, min_path)      # of twice the path
+    share = slip / np.maximum(2 * path, min_path)      # of twice the path
     lowest, highest = 0.8, 1.2      # of a reversed section
     return spans[(path > min_path) & (share > lowest) & (share < highest)]
 
@@ -137,11 +136,11 @@ class _Forces:
     difference of travel weights the acceleration.
     """
 
-    def __init__(self, t: Floats, t_imu: Floats, w_b: Floats, f_b: Floats) -> None:
-        self.angle = integral_at(t, t_imu, w_b)
+    def __init__(self, t: Floats, imu: ImuRows) -> None:
+        self.angle = integral_at(t, imu.t, imu.w_b)
         times = [t + delay for delay in (-ACCELERATION_TIME, 0.0, ACCELERATION_TIME)]
-        self.speed_before, self.speed = (integral_at(x, t_imu, f_b) for x in times[:2])
-        before, middle, after = (double_integral_at(x, t_imu, f_b[:, 0]) for x in times)
+        self.speed_before, self.speed = (integral_at(x, imu.t, imu.f_b) for x in times[:2])
+        before, middle, after = (double_integral_at(x, imu.t, imu.f_b[:, 0]) for x in times)
         self.along = (before - 2 * middle + after) / ACCELERATION_TIME**2
 
 

@@ -17,6 +17,7 @@ from odocal_ros.nav.geodesy import LARGEST_FRAME
 from odocal_ros.nav.time_series import gaps_in_rhythm, gaps_longer
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import glitches
+from odocal_ros.screening.inputs import UsableRows
 from odocal_ros.screening.leg_kind import is_local
 from odocal_ros.settings.config import Config
 
@@ -38,12 +39,12 @@ def topic_gap(slot: str, t: Floats) -> tuple[Reason, ...]:
                    NO_RECEPTION if slot == 'fix' else ''),)
 
 
-def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
-    """Return IMU_GAP if IMU data is missing for over ``limit`` s between t_from and t_stop."""
-    t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
+def imu_gap(t_imu: Floats, t_start: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
+    """Return IMU_GAP if IMU data is missing for over ``limit`` s between t_start and t_stop."""
+    t = t_imu[np.searchsorted(t_imu, t_start - 1e-9):
               np.searchsorted(t_imu, t_stop + 1e-9, side='right')]
-    intervals = [(t_from, t[0]), *gaps_longer(t, limit), (t[-1], t_stop)] if len(t) else [
-        (t_from, t_stop)]
+    intervals = [(t_start, t[0]), *gaps_longer(t, limit), (t[-1], t_stop)] if len(t) else [
+        (t_start, t_stop)]
     gaps = [(float(end - begin), float(begin)) for begin, end in intervals if end - begin > limit]
     if not gaps:
         return ()
@@ -53,13 +54,13 @@ def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[
 
 
 def usable_rows(slot: str, leg: Leg, config: Config,
-                offset: float) -> tuple[Any, Floats, list[Reason]]:
-    """Return the usable rows of a topic, their times from the start mark, (n,) s, and reasons."""
-    sent, label = leg.rows(slot), INPUTS[slot].label
+                offset: float) -> tuple[UsableRows, list[Reason]]:
+    """Return the usable rows of a topic, and reasons; offset : added to their times, s."""
+    samples = leg.rows(slot)
     if slot in WHEELS:
-        sent = _with_zero_for_tiny_speeds(sent)
-    is_valid, impossible, reasons = _find_valid_rows(sent, slot, leg)
-    rows = sent if is_valid.all() else take(sent, is_valid)
+        samples = _with_zero_for_tiny_speeds(samples)
+    is_valid, impossible, reasons = _find_valid_rows(samples, slot, leg)
+    rows = samples if is_valid.all() else take(samples, is_valid)
     if slot in WHEELS:
         rows = _separate_equal_stamps(rows)
     if slot == 'imu':
@@ -71,32 +72,42 @@ def usable_rows(slot: str, leg: Leg, config: Config,
     t = work_array(len(rows.stamp_ns))
     for chunk in chunks(len(t)):
         t[chunk] = (rows.stamp_ns[chunk] - leg.start_ns) * 1e-9 + offset
-    is_outlier = np.zeros(len(t), bool)
-    if slot == 'imu':
-        is_outlier = glitches.imu_glitches(t, rows.w_i, rows.f_i, config.imu)
-    elif slot in WHEELS and leg.form_of(slot).quantity == 'rate':
-        is_outlier = glitches.speed_glitches(t, rows.value.astype(float))
+    is_outlier = _find_outliers(rows, t, slot, leg, config)
     if is_outlier.any():
         reasons.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(is_outlier.sum())} of {len(t)} '
-                              f'{label} messages are isolated outliers, first at t = '
+                              f'{INPUTS[slot].label} messages are isolated outliers, first at t = '
                               f'{t[np.argmax(is_outlier)]:.2f} s; dropped'))
         # outliers and impossible values together may be a damaged group
         if not glitches.near_impossible_groups(impossible).any():
-            sent_row = np.flatnonzero(is_valid)
-            sent_row = sent_row if order is None else sent_row[order]
-            impossible[sent_row[is_outlier]] = True
+            row_numbers = np.flatnonzero(is_valid)      # in ``samples``
+            row_numbers = row_numbers if order is None else row_numbers[order]
+            impossible[row_numbers[is_outlier]] = True
             damaged, damage_reasons = _find_damaged_rows(impossible, is_valid, slot)
-            is_outlier |= damaged[sent_row]
+            is_outlier |= damaged[row_numbers]
             reasons += damage_reasons
         rows, t = take(rows, ~is_outlier), t[~is_outlier]
-    if len(sent.stamp_ns) and not len(t) and slot in NO_ROW_CODES:
-        zero = int((sent.stamp_ns <= 0).sum())
-        reasons.append(Reason(
-            NO_ROW_CODES[slot], f'none of the {len(sent.stamp_ns)} {label} messages is usable'
-            + (f': {zero} have no stamp (0)' if zero else ': values are missing or out of range'),
-            _unstamped_remedy(slot) if zero else 'Check the driver that sends these messages, and '
-            'wait for valid values before the drive.'))
-    return rows, t, reasons
+    if len(samples.stamp_ns) and not len(t) and slot in NO_ROW_CODES:
+        reasons.append(_no_row_reason(samples, slot))
+    return UsableRows(rows, t), reasons
+
+
+def _find_outliers(rows: Any, t: Floats, slot: str, leg: Leg, config: Config) -> Bools:
+    """Return a mask of isolated outliers of an IMU or a speed: (n,) bool."""
+    if slot == 'imu':
+        return glitches.imu_glitches(t, rows.w_i, rows.f_i, config.imu)
+    if slot in WHEELS and leg.form_of(slot).quantity == 'rate':
+        return glitches.speed_glitches(t, rows.value.astype(float))
+    return np.zeros(len(t), bool)
+
+
+def _no_row_reason(samples: Samples, slot: str) -> Reason:
+    """Return the reason for a topic without usable rows."""
+    unstamped = int((samples.stamp_ns <= 0).sum())
+    cause = f'{unstamped} have no stamp (0)' if unstamped else 'values are missing or out of range'
+    return Reason(
+        NO_ROW_CODES[slot], f'none of the {len(samples.stamp_ns)} {INPUTS[slot].label} messages '
+        f'is usable: {cause}', _unstamped_remedy(slot) if unstamped else
+        'Check the driver that sends these messages, and wait for valid values before the drive.')
 
 
 def _unstamped_remedy(slot: str) -> str:
@@ -114,7 +125,7 @@ def _time_text(samples: Samples, index: int, leg: Leg) -> str:
 
 def _find_valid_rows(samples: Any, slot: str, leg: Leg) -> tuple[Bools, Bools, list[Reason]]:
     """
-    Return a mask of valid rows, (n,), one of rows with finite but impossible values, and reasons.
+    Return a mask of valid rows, one of rows with finite but impossible values, and reasons.
 
     A valid row has a stamp and all required values, and is not near a group of impossible rows.
     """
@@ -183,7 +194,7 @@ def _separate_equal_stamps(samples: Any) -> Any:
     repeated_share = 1 / 3    # of all; if each sample is sent twice, it is a half
     if repeated.all() and len(repeated) > repeated_share * len(stamp):
         return samples
-    order = np.arange(len(stamp))
+    order = np.arange(len(stamp))      # each stamp becomes 1 ns or more after the previous one
     return replace(samples, stamp_ns=np.maximum.accumulate(stamp - order) + order)
 
 
@@ -191,21 +202,21 @@ def _spread_packets(imu: Any) -> tuple[Any, list[Reason]]:
     """Return IMU samples, packets of equal stamps spread over the time since the last packet."""
     stamp, min_share = imu.stamp_ns, 1 / 3       # judgement: share of rows; fewer: duplicates
     step = np.diff(stamp)
-    same = step == 0
-    if same.sum() <= min_share * len(stamp) or (step < 0).any():
+    is_same = step == 0      # stamp as before
+    if is_same.sum() <= min_share * len(stamp) or (step < 0).any():
         return imu, []
     repeated = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in (imu.w_i, imu.f_i)], axis=0)
-    if (same & ~repeated).sum() <= min_share * len(stamp):
+    if (is_same & ~repeated).sum() <= min_share * len(stamp):
         return imu, []
-    first = np.flatnonzero(np.append(True, ~same))
+    first = np.flatnonzero(np.append(True, ~is_same))
     count = np.diff(np.append(first, len(stamp)))
     # a packet after a gap has the usual duration
-    usual = int(np.median(np.diff(stamp[first]))) if len(first) > 1 else 0
-    duration = np.minimum(np.diff(stamp[first], prepend=stamp[0] - usual), usual)
+    usual_ns = int(np.median(np.diff(stamp[first]))) if len(first) > 1 else 0
+    duration = np.minimum(np.diff(stamp[first], prepend=stamp[0] - usual_ns), usual_ns)
     rows_to_last = np.repeat(first + count - 1, count) - np.arange(len(stamp))
     spread = replace(imu, stamp_ns=stamp - rows_to_last * np.repeat(duration // count, count))
     return spread, [Reason(
-        Code.STAMPS_NOT_RISING, f'{int(same.sum())} of {len(stamp)} IMU messages repeat the '
+        Code.STAMPS_NOT_RISING, f'{int(is_same.sum())} of {len(stamp)} IMU messages repeat the '
         'previous stamp: all messages of a packet have one stamp; they were spread evenly over '
         'the time since the previous packet',
         'Stamp each message with the time of its measurement.')]
@@ -217,16 +228,16 @@ def _rising_rows(samples: Samples, slot: str, leg: Leg) -> tuple[Ints | None, li
     step = np.diff(stamp)
     if (step > 0).all():
         return None, []
-    keep = _longest_rising(stamp)
+    rising = _longest_rising(stamp)
     same, backward = int((step == 0).sum()), int((step < 0).sum())
     first = int(np.argmax(step <= 0)) + 1
     faults = [f'{same} repeat the previous stamp'] * (same > 0)
     faults += [f'{backward} backward step{"s" * (backward > 1)} (up to {-step.min() * 1e-9:.3g} '
                's)'] * (backward > 0)
-    return keep, [Reason(
+    return rising, [Reason(
         Code.STAMPS_NOT_RISING, f'{INPUTS[slot].label} stamps do not increase: '
         f'{" and ".join(faults)}, first at {_time_text(samples, first, leg)}; '
-        f'{len(stamp) - len(keep)} of {len(stamp)} messages dropped')]
+        f'{len(stamp) - len(rising)} of {len(stamp)} messages dropped')]
 
 
 def _longest_rising(stamp: Ints) -> Ints:
@@ -240,8 +251,8 @@ def _longest_rising(stamp: Ints) -> Ints:
         if length:
             previous[row] = last_rows[length - 1]
         last_values[length:length + 1], last_rows[length:length + 1] = [value], [row]
-    keep, row = [], last_rows[-1]
-    while row >= 0:
-        keep.append(row)
+    rows, row = [], last_rows[-1]
+    while row >= 0:      # from the last one back
+        rows.append(row)
         row = int(previous[row])
-    return np.array(keep[::-1])
+    return np.array(rows[::-1])

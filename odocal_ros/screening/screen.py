@@ -21,13 +21,17 @@ from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import clocks, glitches
 from odocal_ros.screening.axles import usable_axles
+from odocal_ros.screening.dead_reckoned_fixes import dead_reckoned_fixes
 from odocal_ros.screening.even_imu_times import even_imu_times
-from odocal_ros.screening.fix_screen import dead_reckoned_fixes, usable_fixes, velocity_reasons
+from odocal_ros.screening.fix_screen import (
+    rounding_variance,
+    usable_fixes,
+    velocity_reasons,
+)
 from odocal_ros.screening.imu_faults import alternating_imu_reasons, other_frame_reasons
 from odocal_ros.screening.inputs import Inputs, locate_fixes, UsableRows
 from odocal_ros.screening.leg_kind import with_assumed_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, reversing_reasons
-from odocal_ros.screening.rounded_fixes import rounding_variance
 from odocal_ros.screening.row_screen import topic_gap, usable_rows
 from odocal_ros.screening.wheel_travel import LegWheels, travel_of_wheels
 from odocal_ros.settings.config import Config, SIDES
@@ -74,7 +78,7 @@ def screen(leg: Leg, config: Config,
         reasons += glitches.dead_band_reasons(t_imu, imu.w_i, wheels.mean)
         # one axle is only tested with an accelerometer
         if len(wheels.wheels) > (1 if inputs.has_accelerometer else len(SIDES)):
-            wheels, axle_reasons = usable_axles(wheels, inputs.imu, (0.0, inputs.t_stop))
+            wheels, axle_reasons = usable_axles(wheels, inputs.imu, inputs.t_stop)
             reasons += axle_reasons
         inputs = replace(inputs, **_travel_fields(leg, wheels))
     release_mapped_memory()
@@ -122,7 +126,7 @@ def _usable_topics(leg: Leg, config: Config, check_faults: bool,
     offset = clocks.stamp_offsets(config)
 
     def usable(slot: str) -> tuple[UsableRows, list[Reason]]:
-        samples, t, reasons = usable_rows(slot, leg, config, offset[slot])
+        (samples, t), reasons = usable_rows(slot, leg, config, offset[slot])
         if check_faults and hasattr(samples, 'q_ni'):
             samples = glitches.without_invalid_orientations(samples)
         if slot == 'imu':
@@ -174,13 +178,13 @@ def _travel_fields(leg: Leg, wheels: LegWheels) -> dict[str, Any]:
     # of two wheels with unknown sides only the mean is defined
     several = wheels.wheels if leg.form.sides_known and len(wheels.wheels) > 1 else ()
     return {'travel': wheels.mean, 'travels': several,
-            'uncertain_t': wheels.uncertain_t, 'uncertain_sigma': wheels.uncertain_sigma}
+            'uncertain_t': wheels.uncertain_mean.t,
+            'uncertain_sigma': wheels.uncertain_mean.sigma}
 
 
 def _without_reversing(inputs: Inputs, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     """Return inputs with negative counts where the vehicle reverses, and the reason if it does."""
-    spans = reversed_starts(inputs.travel, inputs.t_imu, inputs.w_b, inputs.f_b,
-                            (0.0, inputs.t_stop))
+    spans = reversed_starts(inputs.travel, inputs.imu, inputs.t_stop)
     if not len(spans):
         return inputs, ()
     metres_per_unit = locate_fixes(inputs, config).rough_scale or None

@@ -53,20 +53,20 @@ class WheelPair:
         return 0.3 * self.quantum + 1e-4 * float(np.median(np.abs(steps)))
 
 
-def wheels_on_grid(axle: Sequence[Travel], imu: ImuRows, marks: tuple[float, float],
-                   cell_s: float, uncertain_t: Sequence[float] | Floats = ()) -> WheelPair | None:
+def wheels_on_grid(axle: Sequence[Travel], imu: ImuRows, t_stop: float, cell_s: float,
+                   uncertain_t: Sequence[float] | Floats = ()) -> WheelPair | None:
     """
     Return the wheels in cells of ``cell_s`` s, None with fewer than 20 common cells.
 
-    axle : left and right wheel.   marks : start and stop, s.   uncertain_t : (d,) s, times of
-    uncertain travel; cells next to them are not complete.
+    axle : left and right wheel.   t_stop : s, end of the cells; they begin at 0 at the earliest.
+    uncertain_t : (d,) s, times of uncertain travel; cells next to them are not complete.
     """
     t_imu, w_b, f_b = imu
     left, right = axle
     if min(len(left.t), len(right.t), len(t_imu)) < 2:
         return None
-    begin = max(left.t[0], right.t[0], t_imu[0], marks[0])
-    end = min(left.t[-1], right.t[-1], t_imu[-1], marks[1])
+    begin = max(left.t[0], right.t[0], t_imu[0], 0.0)
+    end = min(left.t[-1], right.t[-1], t_imu[-1], t_stop)
     t = begin + cell_s * np.arange(max(0, int((end - begin) / cell_s) + 1))
     if len(t) < 21:
         return None
@@ -85,13 +85,9 @@ def wheels_on_grid(axle: Sequence[Travel], imu: ImuRows, marks: tuple[float, flo
 
 
 def broken_wheel_reasons(axle: Sequence[Travel], imu: ImuRows,
-                         marks: tuple[float, float]) -> tuple[Reason, ...]:
-    """
-    Return WHEEL_DEAD and WHEEL_REVERSED, once each, if one wheel fails; () if both count.
-
-    axle : left and right wheel.   marks : start and stop, s.
-    """
-    pair = wheels_on_grid(axle, imu, marks, FAULT_CELL)
+                         t_stop: float) -> tuple[Reason, ...]:
+    """Return WHEEL_DEAD and WHEEL_REVERSED if the left or the right wheel fails, else ()."""
+    pair = wheels_on_grid(axle, imu, t_stop, FAULT_CELL)
     if pair is None:
         return ()
     steps = np.diff([pair.left, pair.right])          # (2, n) travel in each cell

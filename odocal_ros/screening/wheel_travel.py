@@ -198,16 +198,11 @@ class LegWheels:
         return mean_travel(unsteered) if all(len(wheel.t) for wheel in unsteered) else unsteered[0]
 
     @property
-    def uncertain_t(self) -> Floats:
-        """Return the times at which the mean is uncertain, s."""
-        return np.concatenate([self.uncertain_travel[wheel.name].t for wheel in self._unsteered])
-
-    @property
-    def uncertain_sigma(self) -> Floats:
-        """Return the sigmas of the mean at these times, scale units."""
-        sigma: Floats = np.concatenate([self.uncertain_travel[wheel.name].sigma
-                                        for wheel in self._unsteered])
-        return sigma / len(self._unsteered)
+    def uncertain_mean(self) -> UncertainTravel:
+        """Return the uncertain parts of the mean."""
+        t, sigma = map(np.concatenate, zip(*(
+            self.uncertain_travel[wheel.name] for wheel in self._unsteered), strict=True))
+        return UncertainTravel(t, sigma / len(self._unsteered))
 
 
 def travel_of_wheels(leg: Leg, config: Config,

@@ -41,7 +41,7 @@ def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=pre
     wheels = [replace(w, s=change(w.s)) for w, change in (
         (inputs.travels[0], left), (inputs.travels[1], right))]
     reasons, slips = wheel_faults(
-        wheels[::-1 if swap else 1], inputs.imu, (0.0, inputs.t_stop), track, latitude,
+        wheels[::-1 if swap else 1], inputs.imu, inputs.t_stop, track, latitude,
         more.pop('rough', 1.0) * metres, **more)
     return tuple(r for r in reasons if r.code not in also), slips
 

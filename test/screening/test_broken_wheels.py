@@ -86,10 +86,10 @@ def robot(right_speed, left_speed, track=0.5, seconds_=200.0):
 
 def test_a_robot_may_turn_about_one_wheel_and_on_the_spot():
     wheels, imu = robot(right_speed=[0.5, 0.5, 0.3, 0.6], left_speed=[0.5, 0.0, -0.3, 0.6])
-    assert broken_wheel_reasons(wheels, imu, (0.0, 200.0)) == ()
+    assert broken_wheel_reasons(wheels, imu, 200.0) == ()
     # the same wheels with zero turn rate: one dead for a while, and opposite directions
     still = imu._replace(w_b=imu.w_b * 0)
-    codes = {r.code for r in broken_wheel_reasons(wheels, still, (0.0, 200.0))}
+    codes = {r.code for r in broken_wheel_reasons(wheels, still, 200.0)}
     assert codes == {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
@@ -97,7 +97,7 @@ def test_a_wheel_without_direction_is_reported_in_reverse_gear():
     wheels, imu = robot(right_speed=[0.5, 0.6, -0.3, 0.7, 0.3],
                         left_speed=[0.5, 0.5, -0.3, 0.7, 0.4])
     up = replace(wheels[1], s=np.append(0.0, np.cumsum(np.abs(np.diff(wheels[1].s)))))
-    (reason,) = broken_wheel_reasons((wheels[0], up), imu, (0.0, 200.0))
+    (reason,) = broken_wheel_reasons((wheels[0], up), imu, 200.0)
     assert reason.code is Code.WHEEL_REVERSED
     assert reason.text.startswith('the right wheel also counts up in reverse')
     assert 'first at t = 20.' in reason.text

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.reasons import Code
-from odocal_ros.screening.fix_screen import dead_reckoned_fixes
+from odocal_ros.screening.dead_reckoned_fixes import dead_reckoned_fixes
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions

@@ -25,6 +25,7 @@ from odocal_ros.screening.imu_orientation import (
     ImuOrientation,
     orientation_reasons,
 )
+from odocal_ros.screening.inputs import ImuRows
 from odocal_ros.screening.reversing import reversed_starts, sections_slipped_twice
 from odocal_ros.screening.screen import screen
 
@@ -273,19 +274,17 @@ def starts(speeds, nose=None, noise=0.0):
     rng = np.random.default_rng(1)
     f = np.gradient(v, t) + 9.81 * np.sin(theta) + noise * rng.standard_normal(len(t))
     s = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) / 2 * 0.02)])
-    return Travel(t, s, 0.0), t, np.stack([zero, -np.gradient(theta, t), zero], -1), \
-        np.stack([f, zero, 9.81 * np.cos(theta)], -1)
+    return Travel(t, s, 0.0), ImuRows(t, np.stack([zero, -np.gradient(theta, t), zero], -1),
+                                      np.stack([f, zero, 9.81 * np.cos(theta)], -1))
 
 
 def test_pitch_of_the_body_and_gentle_starts_are_not_reversing():
     # gravity by the pitch subtracts twice the acceleration from the specific force
-    made_ = starts([8.0, 1.0, 8.0], [0.0, -2.0, 0.0])
-    assert not len(reversed_starts(*made_, (0.0, 50.0)))
-    travel, t, w_b, f_b = made_
-    assert len(reversed_starts(travel, t, 0 * w_b, f_b, (0.0, 50.0)))    # without the gyro
+    travel, imu = starts([8.0, 1.0, 8.0], [0.0, -2.0, 0.0])
+    assert not len(reversed_starts(travel, imu, 50.0))
+    assert len(reversed_starts(travel, imu._replace(w_b=0 * imu.w_b), 50.0))    # without the gyro
     # 0.06 m/s^2 in 2 m/s^2 of white noise at 50 Hz: by chance half of 60 have the wrong sign
-    made_ = starts([12.0] + [0.2] * 60, noise=2.0)
-    assert not len(reversed_starts(*made_, (0.0, 1000.0)))
+    assert not len(reversed_starts(*starts([12.0] + [0.2] * 60, noise=2.0), 1000.0))
 
 
 def test_reversing_before_the_leg_has_no_effect():

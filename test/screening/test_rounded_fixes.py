@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.nav.geodesy import radii
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screening.rounded_fixes import rounding_variance
+from odocal_ros.screening.fix_screen import rounding_variance
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.noise import make_rng
 
