@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from odocal_ros.calib.planar.fit import fit_at, LEVELS, MIN_LEVEL, priors
-from odocal_ros.calib.planar.result import make_planar_result
+from odocal_ros.calib.planar.result import make_planar_result, refused_planar_result
 from odocal_ros.calib.planar.run import make_side_wheels, Run, wheel_rows, Wheels
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Bools, Floats, Ints, running_sum
@@ -28,6 +28,7 @@ from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.nav.geodesy import rate_without_north
 from odocal_ros.nav.time_series import running_integral
 from odocal_ros.pipeline.planar_run import known_values
+from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings import config as settings
 
 MOTION_STEP = 0.1              # s, definition: time step of a motion
@@ -293,4 +294,9 @@ def _fixes_at_rests(t_fix: Floats, motion: RobotMotion) -> Ints:
 def predict_robot(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:
     """Return the prediction of the method that calibrates this robot."""
     by_smoother = robot.imu and robot.drive == settings.DIFFERENTIAL
-    return (predict_with_imu if by_smoother else predict_planar)(motion, robot, config)
+    try:
+        return (predict_with_imu if by_smoother else predict_planar)(motion, robot, config)
+    except np.linalg.LinAlgError:
+        return refused_planar_result([Reason(
+            Code.SCALE_NOT_DETERMINED, 'scale factor: the positions of this run do not determine '
+            'it', 'Plan a run with straights, or positions in motion.')], '1')

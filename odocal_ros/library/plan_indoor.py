@@ -125,7 +125,7 @@ def ratio_sigma(method: MethodResult) -> float | None:
     if 'ratio_sigma' in method.details:
         return float(method.details['ratio_sigma'])
     left, right = (method.estimates.get(f'scale_factor_{side}') for side in SIDES)
-    rho = method.details['correlation'].get('scale_factor_left,scale_factor_right')
+    rho = method.details.get('correlation', {}).get('scale_factor_left,scale_factor_right')
     a, b = (wheel.relative_sigma if wheel else None for wheel in (left, right))
     if a is None or b is None or rho is None:
         return None

@@ -72,6 +72,13 @@ def test_marks_determine_the_width_by_squares_and_not_by_an_eight():
     assert eight.sigma('scale_factor') is None
 
 
+def test_a_run_whose_positions_do_not_determine_its_motion_gives_a_reason():
+    """All rests of an eight are at one place: the normal equations of a small one are singular."""
+    eight, = plan_indoor('figure_eight', reference='marks', imu=False, size=2.0)
+    assert set(eight.to_dict()['sigmas'].values()) == {None}
+    assert [reason.code.name for reason in eight.method.reasons] == ['SCALE_NOT_DETERMINED']
+
+
 @pytest.mark.parametrize(('options', 'message'), [
     ({'run': 'circle'}, '--indoor circle: required: one of all, straight'),
     ({'reference': 'gps'}, '--reference gps: required: one of mocap'),
