@@ -11,14 +11,8 @@ import numpy as np
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage, unknown_name
-from odocal_ros.forecast.planned_indoor import (
-    MOTION_STEP,
-    pattern_motion,
-    PATTERNS,
-    predict_robot,
-    Robot,
-    RobotMotion,
-)
+from odocal_ros.forecast.planned_indoor import predict_robot, Robot
+from odocal_ros.forecast.robot_motion import MOTION_STEP, pattern_motion, PATTERNS, RobotMotion
 from odocal_ros.library.arguments import config_of, Settings
 from odocal_ros.settings.config import DRIVES, HOLONOMIC, SIDES, SKID
 from odocal_ros.sim.options import REFERENCES, SimOptions
@@ -90,8 +84,8 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
     robot = robot_of(options)
     if reference == MARKS:
         sigma = settings.reference.points_sigma if points_sigma is None else points_sigma
-        robot = replace(robot, white=sigma, drift=sigma, drift_length=MARKS_LENGTH, rate=10.0,
-                        at_rests=True)
+        robot = replace(robot, position_sigma=sigma, drift_sigma=sigma,
+                        drift_length=MARKS_LENGTH, position_rate=10.0, at_rests=True)
     motions = {name: pattern_motion(name, size, rounds, drive, speed)
                for name in (PATTERNS if run == 'all' else (run,))}
     return [PlannedRun(name, motion, robot, predict_robot(motion, robot, settings))
@@ -107,8 +101,8 @@ def robot_of(options: SimOptions) -> Robot:
     straight = STRAIGHT_RATIO * options.track_width if options.drive == SKID else 0.0
     return Robot(drive=options.drive, imu=options.imu, width=effective_width(options),
                  straight_width=straight, wheels=max(options.wheels or 2, 2),
-                 slip=options.slip_walk, white=usual['fix_sigma'], rate=usual['fix_rate'],
-                 drift=float(stationary))
+                 slip=options.slip_walk, position_sigma=usual['fix_sigma'],
+                 position_rate=usual['fix_rate'], drift_sigma=float(stationary))
 
 
 def motion_of_drive(options: SimOptions) -> RobotMotion:

@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, runs
 from odocal_ros.nav.rotations import matrix_from_rpy, rotate, rotate_back
-from odocal_ros.sim.motion import inertial_v, Motion, State
+from odocal_ros.sim.motion import Motion, rigid_imu_output, State
 from odocal_ros.sim.profile import hermite, Hills, Profile
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.vehicle_distributions import G
@@ -109,7 +109,7 @@ def rotation(motion: Motion, t: Floats) -> Floats:
 def imu_output(motion: Motion, state: State,
                lever_arm: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
     """Return turn rate, rad/s, and specific force, m/s^2, in body axes; lever arm at rest, m."""
-    w_v, f_v = inertial_v(state, lever_arm)
+    w_v, f_v = rigid_imu_output(state, lever_arm)
     if not motion.tilt:
         return w_v, f_v
     t, arm = state.t, np.asarray(lever_arm, dtype=float)

@@ -18,7 +18,7 @@ from odocal_ros.nav import geodesy
 from odocal_ros.nav.rotations import matrix_from_rpy, rotate, rotate_back
 from odocal_ros.sim.profile import Hills, Profile
 
-STEADY = Profile([0.0, 1.0], [[0.0]])     # definition: no sway
+NO_SWAY = Profile([0.0, 1.0], [[0.0]])     # definition: no sway
 GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # definition: on -1 to 1
 
 
@@ -49,7 +49,7 @@ class State:
     latitude: np.ndarray         # rad
     longitude: np.ndarray        # rad
     height: np.ndarray           # m
-    turned: np.ndarray           # rad, integral of the turn rate about v's z relative to Earth
+    turn_angle: np.ndarray           # rad, integral of the turn rate about v's z relative to Earth
     sway: np.ndarray             # (n, 2) m/s, along v's y and z axes: not measured by wheels
     sway_acceleration: np.ndarray   # (n, 2) m/s^2
 
@@ -64,7 +64,7 @@ class Motion:
     """
 
     def __init__(self, speed: Profile, yaw_rate: Profile, start: Start,
-                 hills: Hills | None = None, sway: tuple[Profile, ...] = (STEADY, STEADY),
+                 hills: Hills | None = None, sway: tuple[Profile, ...] = (NO_SWAY, NO_SWAY),
                  tilt: tuple[Profile, ...] = (), lean: Profile | None = None) -> None:
         self.speed, self.yaw_rate, self.start = speed, yaw_rate, start
         self.hills, self.sway, self.tilt, self.lean = hills or Hills(), sway, tilt, lean
@@ -85,69 +85,73 @@ class Motion:
         """Return the state at times t, (n,) s."""
         t = np.asarray(t, dtype=float)
         node = np.clip(np.searchsorted(self._nodes, t, side='right') - 1, 0, None)
-        east, north, up, turned = self._section(self._nodes[node], t - self._nodes[node])
+        east, north, up, turn = self._motion_from(self._nodes[node], t - self._nodes[node])
         latitude0, height0 = self._latitude[node], self._height[node]
-        latitude, longitude = _steps(latitude0, height0 + up / 2, east, north)
+        latitude, longitude = _angles_from(latitude0, height0 + up / 2, east, north)
         travel, speed, acceleration = self._travel(t), self.speed(t), self._acceleration.mean(t)
-        slope, by_s, by_s2 = self.hills(travel)
+        slope, by_path, by_path2 = self.hills(travel)      # and its derivatives by path length
         return State(
             t=t, travel=travel, speed=speed, acceleration=acceleration,
             yaw=self.start.yaw + self._turn(t), yaw_rate=self.yaw_rate(t),
             yaw_acceleration=self._yaw_acceleration.mean(t), slope=slope,
-            slope_rate=by_s * speed, slope_acceleration=by_s2 * speed**2 + by_s * acceleration,
+            slope_rate=by_path * speed,
+            slope_acceleration=by_path2 * speed**2 + by_path * acceleration,
             latitude=latitude0 + latitude, longitude=self._longitude[node] + longitude,
             height=height0 + up,
-            turned=self._turned[node] + turned + longitude * np.sin(latitude0 + latitude / 2),
+            turn_angle=(self._turn_angle[node] + turn
+                        + longitude * np.sin(latitude0 + latitude / 2)),
             sway=np.stack([profile(t) for profile in self.sway], -1),
             sway_acceleration=np.stack([profile.mean(t) for profile in self._sway_rate], -1))
 
     def _integrate(self) -> None:
+        """Compute latitude, longitude, height and turn at the nodes of the integration."""
         # 0.1 s: at 0.5 rad/s the error of the Gauss rule is then below round-off
         steps = np.arange(0.0, self.duration, 0.1)
         breaks = [p.breaks for p in (self.speed, self.yaw_rate, *self.sway)]
         nodes = np.unique(np.concatenate([steps, [self.duration], *breaks]))
         self._nodes = nodes = nodes[nodes <= self.duration]
-        east, north, up, turned = self._section(nodes[:-1], np.diff(nodes))
+        east, north, up, turn = self._motion_from(nodes[:-1], np.diff(nodes))
         self._height = self.start.height + running_sum(up)
-        middle = (self._height[1:] + self._height[:-1]) / 2
+        height = (self._height[1:] + self._height[:-1]) / 2
         latitude = np.full(len(nodes), self.start.latitude)
         # each round gains four digits: the radii change by 1 % per rad of latitude
         for _ in range(5):
-            step, longitude = _steps_at((latitude[1:] + latitude[:-1]) / 2, middle, east, north)
+            middle = (latitude[1:] + latitude[:-1]) / 2
+            step, longitude = _angles_about(middle, height, east, north)
             latitude = self.start.latitude + running_sum(step)
         self._latitude = latitude
         self._longitude = self.start.longitude + running_sum(longitude)
         # moving east turns the local level relative to the Earth by dlon * sin(lat)
-        self._turned = running_sum(turned + longitude * np.sin((latitude[1:] + latitude[:-1]) / 2))
+        middle = (latitude[1:] + latitude[:-1]) / 2
+        self._turn_angle = running_sum(turn + longitude * np.sin(middle))
 
-    def _section(self, t: Floats, h: Floats) -> list[Floats]:
-        """Return m east, north, up and rad of rotation relative to the level, from t to t + h."""
-        sums = [np.zeros(np.shape(t)) for _ in range(4)]
+    def _motion_from(self, t: Floats, duration: Floats) -> Floats:
+        """Return m east, north, up, and rad of turn relative to the level, from t on: (4, n)."""
+        total = np.zeros((4, *np.shape(t)))
         for node, weight in GAUSS:
-            t_node, w = t + (node + 1) / 2 * h, weight / 2
+            t_node, dt = t + (node + 1) / 2 * duration, weight / 2 * duration
             yaw, slope = self.start.yaw + self._turn(t_node), self.hills(self._travel(t_node))[0]
-            ds, side, rise = (w * h * p(t_node) for p in (self.speed, *self.sway))
-            level = ds * np.cos(slope) - rise * np.sin(slope)
-            for total, part in zip(sums, (
-                    level * np.cos(yaw) - side * np.sin(yaw),
-                    level * np.sin(yaw) + side * np.cos(yaw),
-                    ds * np.sin(slope) + rise * np.cos(slope),
-                    w * h * self.yaw_rate(t_node) * np.cos(slope)), strict=True):
-                total += part
-        return sums
+            ahead, side, rise = (dt * velocity(t_node) for velocity in (self.speed, *self.sway))
+            level = ahead * np.cos(slope) - rise * np.sin(slope)
+            total += [level * np.cos(yaw) - side * np.sin(yaw),
+                      level * np.sin(yaw) + side * np.cos(yaw),
+                      ahead * np.sin(slope) + rise * np.cos(slope),
+                      dt * self.yaw_rate(t_node) * np.cos(slope)]
+        return total
 
 
-def _steps_at(latitude: Floats, height: Floats, east: Floats,
-              north: Floats) -> tuple[Floats, Floats]:
-    """Return the change of latitude and longitude of steps about a middle latitude."""
+def _angles_about(latitude: Floats, height: Floats, east: Floats,
+                  north: Floats) -> tuple[Floats, Floats]:
+    """Return the changes, rad, of latitude and longitude by steps, m, about a middle latitude."""
     meridian, normal = geodesy.radii(latitude)
     return north / (meridian + height), east / ((normal + height) * np.cos(latitude))
 
 
-def _steps(latitude: Floats, height: Floats, east: Floats, north: Floats) -> tuple[Floats, Floats]:
-    """Return the change of latitude and longitude of steps, m, that begin at latitude."""
-    step, _ = _steps_at(latitude, height, east, north)
-    return _steps_at(latitude + step / 2, height, east, north)
+def _angles_from(latitude: Floats, height: Floats, east: Floats,
+                 north: Floats) -> tuple[Floats, Floats]:
+    """Return the changes, rad, of latitude and longitude by steps, m, that begin at latitude."""
+    step, _ = _angles_about(latitude, height, east, north)
+    return _angles_about(latitude + step / 2, height, east, north)
 
 
 def attitude(state: State) -> Floats:
@@ -161,10 +165,11 @@ def velocity_n(state: State) -> Floats:
 
 
 def _velocity_v(state: State) -> Floats:
+    """Return the velocity over ground of v's origin in v, m/s: (n, 3)."""
     return np.concatenate([state.speed[:, None], state.sway], axis=1)
 
 
-def inertial_v(state: State,
+def rigid_imu_output(state: State,
                lever_arm_v: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
     """
     Return the output of a perfect IMU at ``lever_arm_v`` (m, in v), in axes v: w_v, f_v.
@@ -213,9 +218,9 @@ def _gravity_change(state: State, d_n: Floats, gamma: Floats) -> Floats:
     return np.stack([-gravity_at_d * tilt_e, -gravity_at_d * tilt_n, gamma - gravity_at_d], -1)
 
 
-def point(state: State, lever_arm_v: tuple[float, float, float],
+def point_geodetic(state: State, lever_arm_v: tuple[float, float, float],
           tilt: Floats | None = None) -> tuple[Floats, Floats, Floats]:
-    """Return latitude, longitude (rad), height (m) of a point of the body, which is tilted."""
+    """Return latitude, longitude, rad, and height, m, of a point of the body; tilt: C_vb."""
     C = geodesy.C_en(state.latitude, state.longitude) @ attitude(state)
     C = C if tilt is None else C @ tilt
     r_e = geodesy.ecef_from_geodetic(state.latitude, state.longitude, state.height)
@@ -227,9 +232,10 @@ def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float
     """Return the path of a wheel with contact at lever_arm_v, m; lean: of the road, rad."""
     _, y, z = lever_arm_v
     if not np.any(lean):
-        return state.travel - y * state.turned - z * state.slope
+        return state.travel - y * state.turn_angle - z * state.slope
     side = y * np.cos(lean) - z * np.sin(lean)
-    turns = np.diff(state.turned, prepend=0.0)
+    turns = np.diff(state.turn_angle, prepend=0.0)
+    # the arm at a step is the mean of its ends
     by_turn: Floats = np.cumsum((side + np.append(y, side[:-1])) / 2 * turns)
     return state.travel - by_turn - z * state.slope
 

@@ -16,15 +16,16 @@ from numpy.typing import ArrayLike
 
 from odocal_ros.data.arrays import Floats, Ints
 
-Piece = tuple[float, tuple[float, float, float, float]]    # duration, powers of time in it
+# duration, s, and the factors of time**0 to time**3 since the beginning of the piece
+Piece = tuple[float, tuple[float, float, float, float]]
 KERB_LENGTH = 0.5    # m, judgement: path in which a wheel of a robot climbs a kerb
 
 
 class Profile:
     """
-    A piecewise polynomial, held constant before its first and after its last break.
+    A piecewise polynomial, constant before its first and after its last break.
 
-    breaks : (m + 1,) rising, s.   powers : (m, d) coefficients of (t - breaks[i]) ** 0, 1, ...
+    breaks : (m + 1,) rising, s.   powers : (m, d) factors of (t - breaks[i]) ** 0, 1, ...
     """
 
     def __init__(self, breaks: ArrayLike, powers: ArrayLike) -> None:
@@ -61,6 +62,7 @@ class Profile:
         return Profile(self.breaks, powers)
 
     def _piece(self, t: ArrayLike) -> Ints:
+        """Return the index of the piece that contains each time."""
         piece = np.searchsorted(self.breaks, t, side='right') - 1
         return np.clip(piece, 0, len(self.powers) - 1)
 
@@ -70,12 +72,12 @@ class Profile:
 
 
 def line(duration: float, start: float, end: float) -> Piece:
-    """Return one piece: (duration, powers), straight from one value to another."""
+    """Return a piece that is linear from one value to another."""
     return duration, (start, (end - start) / duration if duration else 0.0, 0.0, 0.0)
 
 
 def smooth(duration: float, start: float, end: float) -> Piece:
-    """Return one piece with level ends: 3 x^2 - 2 x^3 between the values."""
+    """Return a piece from one value to another as 3 x^2 - 2 x^3, whose ends have slope 0."""
     rise = end - start
     return duration, (start, 0.0, 3 * rise / duration**2, -2 * rise / duration**3)
 
@@ -89,22 +91,21 @@ def hermite(breaks: Floats, values: Floats, slopes: Floats) -> Profile:
 
 
 def chain(pieces: Iterable[Piece]) -> Profile:
-    """Join pieces end to end from time 0; pieces without duration are dropped."""
-    kept = [(d, p) for d, p in pieces if d > 0]
+    """Return the pieces one after another, from time 0; pieces without duration are dropped."""
+    durations, powers = zip(*(piece for piece in pieces if piece[0] > 0), strict=True)
     # breaks rounded to ns, so that a break meant for a sample's stamp is on it
-    breaks = np.round(np.cumsum([0.0] + [d for d, _ in kept]), 9)
-    return Profile(breaks, [p for _, p in kept])
+    return Profile(np.round(np.cumsum([0.0, *durations]), 9), powers)
 
 
 def ramp(duration: float, gain: float, blend: float = 1.0) -> list[Piece]:
-    """Return acceleration pieces that gain m/s in ``duration``; blend: s of rise and fall."""
+    """Return accelerations that change the speed by ``gain``, m/s; blend: s of rise and fall."""
     blend = min(blend, duration / 2)
     peak = gain / (duration - blend)
     return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak), line(blend, peak, 0.0)]
 
 
 def turn(duration: float, angle: float, blend: float) -> list[Piece]:
-    """Return the turn-rate pieces that turn by ``angle``, with smooth flanks of ``blend`` s."""
+    """Return turn rates that turn by ``angle``, rad; blend: s of rise and fall."""
     peak = angle / (duration - blend)
     return [smooth(blend, 0.0, peak), line(duration - 2 * blend, peak, peak),
             smooth(blend, peak, 0.0)]
@@ -117,21 +118,20 @@ def hold(duration: float) -> list[Piece]:
 
 @dataclass(frozen=True)
 class Hills:
-    """Slope of the road by distance: slope * sin(2 pi s / length), rad, positive uphill; kerbs."""
+    """Slope of the road by distance s: slope * sin(2 pi s / length), rad, and kerbs."""
 
-    slope: float = 0.0
+    slope: float = 0.0       # rad, positive uphill
     length: float = 1000.0   # m
     kerbs: tuple[tuple[float, float], ...] = ()    # (distance of its beginning, height) m each
 
     def __call__(self, travel: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return slope and its first and second derivative by distance."""
+        """Return the slope at a travel, m, and its first and second derivative by distance."""
         k = 2 * np.pi / self.length
         wave, cosine_wave = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
         _, sine, sine_by_path, sine_by_path2 = self._over_kerbs(travel)
         cosine = np.sqrt(1 - sine**2)
         return (wave + np.arcsin(sine), k * cosine_wave + sine_by_path / cosine,
-                -k**2 * wave + sine_by_path2 / cosine
-                + sine_by_path**2 * sine / cosine**3)
+                -k**2 * wave + sine_by_path2 / cosine + sine_by_path**2 * sine / cosine**3)
 
     def chord(self, travel: Floats, wheelbase: float) -> tuple[Floats, Floats]:
         """Return the slope of the line from ``travel`` to a wheelbase ahead and its derivative."""

@@ -16,7 +16,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.geodesy import radii
 from odocal_ros.sim import body
-from odocal_ros.sim.motion import Motion, point
+from odocal_ros.sim.motion import Motion, point_geodetic
 from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, stamps, TRANSPORT_DELAY
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real_effects import RealEffects
@@ -187,7 +187,7 @@ def fused_errors(t: Floats, errors: Floats, options: SimOptions) -> Floats:
 
 def _antenna(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
     tilt = body.rotation(motion, t) if motion.tilt else None
-    return point(motion.at(t), options.antenna_lever_arm, tilt)
+    return point_geodetic(motion.at(t), options.antenna_lever_arm, tilt)
 
 
 def position_errors(t: Floats, options: SimOptions) -> Floats | float:

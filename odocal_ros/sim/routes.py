@@ -4,12 +4,13 @@
 """
 Named routes of simulated drives: speed and turn rate by time, with stops, ramps and turns.
 
-In: a duration, s, and random numbers. Out: a ``Route``. ``speed`` and ``rate`` of a segment are
-the pieces of acceleration and turn rate; both have the same duration.
+In: a duration, s, and a random generator. Out: a ``Route``. A route is a chain of segments: pieces
+of acceleration and of turn rate, which are integrated to speed and yaw.
 """
 
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,11 +22,31 @@ STILL = 5.0            # s at standstill, at the start and at the end
 LONGEST_CYCLE = 19.0   # s of a cycle with the shortest straight
 BLEND = 0.4            # s, rise time of an acceleration or a turn rate
 
-Segment = tuple[list[Piece], list[Piece]]     # accelerations and turn rates of equal duration
+
+class Segment(NamedTuple):
+    """Pieces of a section of a route; both lists have the same duration."""
+
+    acceleration: list[Piece]    # m/s^2
+    yaw_rate: list[Piece]        # rad/s
+
+    @property
+    def duration(self) -> float:
+        """Return the duration, s."""
+        return round(sum(seconds for seconds, _ in self.acceleration), 9)
 
 
 def _standstill(seconds: float) -> Segment:
-    return hold(seconds), hold(seconds)
+    return Segment(hold(seconds), hold(seconds))
+
+
+def _draw_times(rng: np.random.Generator, *ranges: tuple[float, float]) -> list[float]:
+    """Return a random time in each range, s, rounded to 0.1 s."""
+    return [_tenth(rng.uniform(*limits)) for limits in ranges]
+
+
+def _draw_angle(rng: np.random.Generator, least: float, most: float) -> float:
+    """Return a random angle of ``least`` to ``most`` deg to the left or right, rad."""
+    return float(rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(least, most)))
 
 
 def _robot_segments(duration: float, rng: np.random.Generator, cycles: int = 1) -> list[Segment]:
@@ -37,51 +58,48 @@ def _robot_segments(duration: float, rng: np.random.Generator, cycles: int = 1) 
     """
     remaining = _remaining_time('indoor', duration, 2 * STILL,
                                 least=math.ceil(cycles * LONGEST_CYCLE))
-    segments, side, k = [_standstill(STILL)], rng.choice([-1.0, 1.0]), 0
+    segments, side = [_standstill(STILL)], rng.choice([-1.0, 1.0])
     while remaining >= LONGEST_CYCLE:
-        speed, rate, length = _cycle(rng, side, bool(k % 2), remaining)
-        segments.append((speed, rate))
-        remaining, side, k = round(remaining - length, 9), -side, k + 1
+        segments.append(_robot_cycle(rng, side, len(segments) % 2 == 0, remaining))
+        remaining, side = round(remaining - segments[-1].duration, 9), -side
     segments.append(_standstill(STILL + remaining))
     return segments
 
 
-def _cycle(rng: np.random.Generator, side: float, arc: bool,
-           remaining: float) -> tuple[list[Piece], list[Piece], float]:
-    """Return accelerations, turn rates and duration of a move and a turn to a side."""
-    up, down, wait, pause = (round(float(rng.uniform(*r)), 1) for r in (
-        (1.0, 1.5), (1.0, 1.5), (0.5, 2.0), (0.5, 2.0)))
-    top, cruise = rng.uniform(0.2, 1.2), round(min(rng.uniform(2.0, 8.0), remaining - 15.0), 1)
-    arc_angle = arc * rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 90))
+def _robot_cycle(rng: np.random.Generator, side: float, is_arc: bool, remaining: float) -> Segment:
+    """Return a move and a turn on the spot to a side: 1 left, -1 right."""
+    up, down, wait, pause = _draw_times(rng, (1.0, 1.5), (1.0, 1.5), (0.5, 2.0), (0.5, 2.0))
+    top, cruise = rng.uniform(0.2, 1.2), _tenth(min(rng.uniform(2.0, 8.0), remaining - 15.0))
+    arc_angle = is_arc * _draw_angle(rng, 30, 90)
     angle = side * math.radians(rng.uniform(45, 200))
-    spot = round(abs(angle) / rng.uniform(0.5, 1.2) + BLEND, 1)
-    speed = ramp(up, top, BLEND) + hold(cruise) + ramp(down, -top, BLEND)
-    rate = hold(up) + turn(cruise, arc_angle, BLEND) + hold(down)
-    return (speed + hold(wait + spot + pause), rate + hold(wait) + turn(spot, angle, BLEND)
-            + hold(pause), round(up + cruise + down + wait + spot + pause, 9))
+    spot = _tenth(abs(angle) / rng.uniform(0.5, 1.2) + BLEND)
+    return Segment(
+        ramp(up, top, BLEND) + hold(cruise) + ramp(down, -top, BLEND) + hold(wait + spot + pause),
+        hold(up) + turn(cruise, arc_angle, BLEND) + hold(down + wait) + turn(spot, angle, BLEND)
+        + hold(pause))
 
 
 @dataclass(frozen=True)
 class Route:
-    """Speed (m/s), yaw rate (rad/s) and velocity to the left (m/s) by time, s."""
+    """Motion by time, s."""
 
-    speed: Profile
-    yaw_rate: Profile
-    side: Profile | None = None
+    speed: Profile                  # m/s
+    yaw_rate: Profile               # rad/s
+    side: Profile | None = None     # m/s to the left; None: 0
 
 
 def paper(duration: float, rng: np.random.Generator) -> Route:
     """Return the drive of the paper's section 3: 300 s still, 20 m/s for 520 s, 30 s still."""
     cruise = _remaining_time('paper', duration, 300 + 40 + 40 + 30)
     pieces = (hold(300) + ramp(40, 20, 0.0) + hold(cruise) + ramp(40, -20, 0.0) + hold(30))
-    return _route([(pieces, hold(duration))])
+    return _route([Segment(pieces, hold(duration))])
 
 
 def straight(duration: float, rng: np.random.Generator) -> Route:
     """Return one straight run: 60 s still, 25 s up to 12 m/s, cruise, 25 s down, 60 s still."""
     cruise = _remaining_time('straight', duration, 60 + 25 + 25 + 60)
     pieces = hold(60) + ramp(25, 12) + hold(cruise) + ramp(25, -12) + hold(60)
-    return _route([(pieces, hold(duration))])
+    return _route([Segment(pieces, hold(duration))])
 
 
 def out_and_back(duration: float, rng: np.random.Generator) -> Route:
@@ -91,9 +109,9 @@ def out_and_back(duration: float, rng: np.random.Generator) -> Route:
     outbound = hold(60) + ramp(15, 15) + hold(cruise) + ramp(15, -15) + hold(30)
     u_turn = ramp(5, 4) + hold(2 + 14 + 2) + ramp(10, 11)
     inbound = hold(cruise) + ramp(15, -15) + hold(60)
-    return _route([(outbound, hold(60 + 15 + cruise + 15 + 30)),
-                   (u_turn, hold(7) + turn(14, math.pi, 2.0) + hold(12)),
-                   (inbound, hold(cruise + 75))])
+    return _route([Segment(outbound, hold(60 + 15 + cruise + 15 + 30)),
+                   Segment(u_turn, hold(7) + turn(14, math.pi, 2.0) + hold(12)),
+                   Segment(inbound, hold(cruise + 75))])
 
 
 def town(duration: float, rng: np.random.Generator) -> Route:
@@ -108,12 +126,11 @@ def town(duration: float, rng: np.random.Generator) -> Route:
     remaining = _remaining_time('town', duration, 20 + 15, enough=enough)
     segments, heading_change = [_standstill(20)], 0.0
     while remaining >= 90.0 or not segments[1:]:
-        speed, rate, heading_change = _town_cycle(rng, heading_change)
-        length = round(sum(d for d, _ in speed), 9)
-        if length > remaining:
+        cycle, heading_change = _town_cycle(rng, heading_change)
+        if cycle.duration > remaining:
             break
-        segments.append((speed, rate))
-        remaining -= length
+        segments.append(cycle)
+        remaining -= cycle.duration
     if not segments[1:]:
         raise BadUsage(f'scenario town: --duration {duration:g} s is too short for a stop-and-go '
                        f'cycle; give {enough:g} s or more')
@@ -128,23 +145,23 @@ def motorway(duration: float, rng: np.random.Generator) -> Route:
     Still for 40 s, up in 25 to 40 s with a curve at about 6 deg/s; then sections of
     15 to 45 s that change the speed by up to 6 m/s or turn at 0.2 to 1.2 deg/s; 30 s down, still.
     """
-    up, down = _tenth(rng.uniform(25, 40)), _tenth(rng.uniform(25, 40))
-    ramp_top, fast = 12.0, rng.uniform(25, 36)
+    up, down = _draw_times(rng, (25, 40), (25, 40))
+    ramp_top, fast = 12.0, rng.uniform(25, 36)    # m/s
     slip_road = ramp(10, ramp_top) + hold(12)
-    bend = turn(10, rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 60)), 2.0)
+    bend = turn(10, _draw_angle(rng, 30, 60), 2.0)
     remaining = _remaining_time('motorway', duration, 40 + 22 + up + down + 30)
     segments = [_standstill(40),
-                (slip_road + ramp(up, fast - ramp_top),
-                 hold(11) + bend + hold(1 + up))]
+                Segment(slip_road + ramp(up, fast - ramp_top), hold(11) + bend + hold(1 + up))]
     while remaining >= 60:
         length = _tenth(rng.uniform(15, 45))
         new_speed = rng.uniform(max(25.0, fast - 6), min(36.0, fast + 6))
-        angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(0.2, 1.2)) * (length - 6)
+        angle = _draw_angle(rng, 0.2, 1.2) * (length - 6)
         change = _tenth(rng.uniform(8, 14))
-        segments.append((ramp(change, new_speed - fast) + hold(length - change),
-                         turn(length, angle, 6.0)))
+        segments.append(Segment(ramp(change, new_speed - fast) + hold(length - change),
+                                turn(length, angle, 6.0)))
         fast, remaining = new_speed, round(remaining - length, 9)
-    segments.append((hold(remaining) + ramp(down, -fast) + hold(30), hold(remaining + down + 30)))
+    segments.append(Segment(hold(remaining) + ramp(down, -fast) + hold(30),
+                            hold(remaining + down + 30)))
     return _route(segments)
 
 
@@ -154,12 +171,11 @@ def oval(duration: float, rng: np.random.Generator) -> Route:
     bend = _tenth(math.pi * fast / 4.0 + 3.0)     # at 4 m/s^2 to the side, with flanks of 3 s
     remaining = _remaining_time('oval', duration, 40 + 12 + 12 + 20,
                                 least=math.ceil(2 * (straight + bend)))
-    laps = int(remaining / (straight + bend))
-    rest = round(remaining - laps * (straight + bend), 9)
-    segments = [(hold(40) + ramp(12, fast), hold(52))]
-    segments += [(hold(straight + bend), hold(straight) + turn(bend, math.pi, 3.0))] * laps
-    segments.append((ramp(12, -fast) + hold(20 + rest), hold(32 + rest)))
-    return _route(segments)
+    half_laps = int(remaining / (straight + bend))
+    rest = round(remaining - half_laps * (straight + bend), 9)
+    half_lap = Segment(hold(straight + bend), hold(straight) + turn(bend, math.pi, 3.0))
+    return _route([Segment(hold(40) + ramp(12, fast), hold(52)), *[half_lap] * half_laps,
+                   Segment(ramp(12, -fast) + hold(20 + rest), hold(32 + rest))])
 
 
 def yard(duration: float, rng: np.random.Generator) -> Route:
@@ -173,16 +189,15 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
     segments = [_standstill(20)]
     while remaining >= longest:
         top = rng.uniform(0.6, 2.2) * rng.choice([-1.0, 1.0], p=[0.2, 0.8])
-        up, down, before, after = (_tenth(rng.uniform(*r)) for r in (
-            (2.0, 4.0), (2.0, 4.0), (0, 4), (0, 4)))
-        angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(20, 120))
+        up, down, before, after = _draw_times(rng, (2.0, 4.0), (2.0, 4.0), (0, 4), (0, 4))
+        angle = _draw_angle(rng, 20, 120)
         turning = _tenth(abs(angle) / math.radians(rng.uniform(10, 40)) + 1.0)
         stop = _tenth(rng.uniform(3, 9))
         cruise = before + turning + after
-        segments.append((ramp(up, top, 0.5) + hold(cruise) + ramp(down, -top, 0.5) + hold(stop),
-                         hold(up + before) + turn(turning, angle, 0.5)
-                         + hold(after + down + stop)))
-        remaining = round(remaining - up - cruise - down - stop, 9)
+        segments.append(Segment(
+            ramp(up, top, 0.5) + hold(cruise) + ramp(down, -top, 0.5) + hold(stop),
+            hold(up + before) + turn(turning, angle, 0.5) + hold(after + down + stop)))
+        remaining = round(remaining - segments[-1].duration, 9)
     segments.append(_standstill(15 + remaining))
     return _route(segments)
 
@@ -200,42 +215,40 @@ def square(duration: float, rng: np.random.Generator) -> Route:
     """
     rest = _remaining_time('square', duration, 10 + 8 * 17, least=5.0)
     # 4 m: a ramp of 1 s is as long as half a second at full speed
-    speed = ramp(1.0, 0.5, BLEND) + hold(7.0) + ramp(1.0, -0.5, BLEND) + hold(8.0)
-    sides = [(speed, hold(12.0) + turn(2.0, side * math.pi / 2, BLEND) + hold(3.0))
+    move = ramp(1.0, 0.5, BLEND) + hold(7.0) + ramp(1.0, -0.5, BLEND) + hold(8.0)
+    sides = [Segment(move, hold(12.0) + turn(2.0, side * math.pi / 2, BLEND) + hold(3.0))
              for side in [1.0] * 4 + [-1.0] * 4]
     return _route([_standstill(10.0), *sides, _standstill(rest)])
 
 
 def with_sideways_moves(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves of ``indoor``, every third one sideways."""
-    parts = _robot_segments(duration, rng, cycles=3)
-    still = [hold(sum(d for d, _ in speed)) for speed, _ in parts]
-    is_sideways = [k % 3 == 2 for k in range(len(parts))]
-    route = _route([(rest if sideways else speed, rate) for (speed, rate), rest, sideways in zip(
-        parts, still, is_sideways, strict=True)])
-    side = chain([piece for (speed, _), rest, sideways in zip(
-        parts, still, is_sideways, strict=True) for piece in (speed if sideways else rest)])
-    return replace(route, side=_without_rounding(side.integral()))
+    forward, sideways = [], list[Piece]()
+    for k, (acceleration, yaw_rate) in enumerate(_robot_segments(duration, rng, cycles=3)):
+        rest = hold(sum(seconds for seconds, _ in acceleration))
+        is_sideways = k % 3 == 2
+        forward.append(Segment(rest if is_sideways else acceleration, yaw_rate))
+        sideways += acceleration if is_sideways else rest
+    return replace(_route(forward), side=_without_rounding(chain(sideways).integral()))
 
 
-def _town_cycle(rng: np.random.Generator,
-                heading_change: float) -> tuple[list[Piece], list[Piece], float]:
-    """Return accelerations and turn rates of a cycle, and the heading change after it, rad."""
+def _town_cycle(rng: np.random.Generator, heading_change: float) -> tuple[Segment, float]:
+    """Return a cycle of ``town``, and the heading change after it since the start, rad."""
     up, top, down = _tenth(rng.uniform(5, 12)), rng.uniform(9, 14), _tenth(rng.uniform(6, 12))
-    before, turning, between = (_tenth(rng.uniform(*r)) for r in ((1, 8), (6, 10), (2, 8)))
-    weave, after, stop = (_tenth(rng.uniform(*r)) for r in ((4, 6), (1, 6), (4, 15)))
-    angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(60, 110))
+    before, turning, between, weave, after, stop = _draw_times(
+        rng, (1, 8), (6, 10), (2, 8), (4, 6), (1, 6), (4, 15))
+    angle = _draw_angle(rng, 60, 110)
     side_limit, blend = 3.0, 1.5    # m/s^2 to the side; s, rise time of a turn rate
     turning = max(turning, _tenth(abs(angle) * top / side_limit + blend))
     if abs(heading_change + angle) > math.radians(110.0):    # so that the drive leads away
         angle = -angle
-    side = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(4, 10))
+    lane_change = _draw_angle(rng, 4, 10)
     cruise = before + turning + between + 2 * weave + after
-    speed = ramp(up, top) + hold(cruise) + ramp(down, -top) + hold(stop)
-    rate = (hold(up + before) + turn(turning, angle, blend) + hold(between)
-            + turn(weave, side, blend) + turn(weave, -side, blend)
-            + hold(after + down + stop))
-    return speed, rate, heading_change + angle
+    return Segment(
+        ramp(up, top) + hold(cruise) + ramp(down, -top) + hold(stop),
+        hold(up + before) + turn(turning, angle, blend) + hold(between)
+        + turn(weave, lane_change, blend) + turn(weave, -lane_change, blend)
+        + hold(after + down + stop)), heading_change + angle
 
 
 def _tenth(seconds: float) -> float:
@@ -253,8 +266,10 @@ def _remaining_time(name: str, duration: float, fixed: float, least: float = 10.
 
 
 def _route(segments: list[Segment]) -> Route:
-    acceleration = chain([p for speed, _ in segments for p in speed])
-    yaw_rate = chain([p for _, rate in segments for p in rate])
+    """Return the route of a chain of segments."""
+    acceleration, yaw_rate = (
+        chain([piece for pieces in lists for piece in pieces])
+        for lists in zip(*segments, strict=True))
     return Route(_without_rounding(acceleration.integral()), yaw_rate)
 
 
@@ -265,6 +280,5 @@ def _without_rounding(speed: Profile) -> Profile:
     return Profile(speed.breaks, powers)
 
 
-ROUTES = {'paper': paper, 'straight': straight, 'out_and_back': out_and_back, 'town': town,
-          'motorway': motorway, 'oval': oval, 'yard': yard,
-          'indoor': indoor, 'square': square}
+ROUTES = {route.__name__: route for route in (
+    paper, straight, out_and_back, town, motorway, oval, yard, indoor, square)}

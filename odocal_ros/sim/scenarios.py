@@ -17,7 +17,7 @@ from odocal_ros.nav.geodesy import local_fixes
 from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_rpy, yaw_from_heading
 from odocal_ros.settings.config import HOLONOMIC
 from odocal_ros.sim import body, sensors
-from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
+from odocal_ros.sim.motion import attitude, Motion, NO_SWAY, Start
 from odocal_ros.sim.noise import make_rng, stamps
 from odocal_ros.sim.options import DEFAULTS, Reference, REFERENCES, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Hills, Profile
@@ -130,7 +130,7 @@ def motion_of(options: SimOptions) -> Motion:
     if lean:
         optional['lean'] = lean
     if route.side is not None:
-        optional['sway'] = route.side, STEADY
+        optional['sway'] = route.side, NO_SWAY
     elif options.sway or real.sideslip or lean:
         optional['sway'] = _sway(route, options, lean)
     if real.squat or real.body_roll or real.wheelbase or real.kneeling or lean:

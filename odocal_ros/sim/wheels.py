@@ -110,16 +110,16 @@ def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
     if options.drive == OMNI:       # it rolls clockwise about the middle, seen from above
         radius = np.hypot(x, y)
         lateral = running_integral(state.t, state.sway[:, 0])
-        return np.asarray((y * state.travel - x * lateral) / radius - radius * state.turned)
+        return np.asarray((y * state.travel - x * lateral) / radius - radius * state.turn_angle)
     side = -1.0 if y > 0 else 1.0       # left, right
     if options.drive == MECANUM:
         lateral = running_integral(state.t, state.sway[:, 0]) / LATERAL_RATIO
         rollers = side if wheel.name.startswith('front') else -side
         return (state.travel + rollers * lateral
-                + side * effective_width(options) / 2 * state.turned)
+                + side * effective_width(options) / 2 * state.turn_angle)
     rate = np.maximum(np.abs(state.yaw_rate), 1e-9)
     half = options.track_width * _widening(np.abs(state.speed) / rate, options.track_width) / 2
-    turns = np.diff(state.turned, prepend=state.turned[:1])
+    turns = np.diff(state.turn_angle, prepend=state.turn_angle[:1])
     by_turn: Floats = np.cumsum((half + np.append(half[:1], half[:-1])) / 2 * turns)
     return state.travel + side * by_turn
 

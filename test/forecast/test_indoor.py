@@ -11,7 +11,8 @@ import pytest
 
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.forecast.forecast import Abandoned
-from odocal_ros.forecast.planned_indoor import pattern_motion, PATTERNS, predict_robot, Robot
+from odocal_ros.forecast.planned_indoor import predict_robot, Robot
+from odocal_ros.forecast.robot_motion import pattern_motion, PATTERNS
 from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.library.plan_indoor import motion_of_drive, plan_indoor, ratio_sigma, robot_of
 from odocal_ros.pipeline.calibrate import calibrate
@@ -36,7 +37,7 @@ def test_a_pattern_ends_at_the_end_of_its_moves(name, drive):
 def test_the_scale_of_exact_positions_is_limited_by_the_slip():
     """Of two wheels: slip sqrt(T / 2) over the path, T s in motion straight ahead."""
     motion = pattern_motion('straight', 4.0, 3, 'differential')
-    robot = Robot(drive='differential', imu=False, width=0.3, slip=SLIP, white=1e-5)
+    robot = Robot(drive='differential', imu=False, width=0.3, slip=SLIP, position_sigma=1e-5)
     found = predict_robot(motion, robot, Config())
     moving = (motion.speed > 0).sum() * 0.1
     closed = SLIP * math.sqrt(moving / 2) / motion.distance

@@ -96,9 +96,9 @@ def integrate(motion, rate, arm):
     n = int(motion.duration * rate) + 1
     h = 1 / rate
     state = motion.at(np.arange(n) * h)
-    w, f = true_motion.inertial_v(state, arm)
+    w, f = true_motion.rigid_imu_output(state, arm)
     C_ev = C_en(state.latitude, state.longitude) @ true_motion.attitude(state)
-    latitude, longitude, height = true_motion.point(state, arm)
+    latitude, longitude, height = true_motion.point_geodetic(state, arm)
     truth = ecef_from_geodetic(latitude, longitude, height)
     C, r, v = C_ev[0], truth[0], np.zeros(3)
     earth = np.array([0, 0, OMEGA])
@@ -154,10 +154,10 @@ def test_going_east_turns_the_vehicle_against_the_earth():
                                 true_motion.Start(np.radians(60), 0.0, 0.0, 0.0))
     end = motion.at([1000.0])
     # the level turns by dlon * sin(lat); a parallel is a curve to the left, 19.8 km: 0.0054 rad
-    assert end.turned[0] == pytest.approx(end.longitude[0] * np.sin(np.radians(60)), rel=1e-9)
+    assert end.turn_angle[0] == pytest.approx(end.longitude[0] * np.sin(np.radians(60)), rel=1e-9)
     rolled = [true_motion.contact_travel(end, (0.0, y, 0.0))[0] for y in (0.8, -0.8)]
-    assert rolled[1] - rolled[0] == pytest.approx(1.6 * end.turned[0], rel=1e-8)
-    assert end.turned[0] > 0.005
+    assert rolled[1] - rolled[0] == pytest.approx(1.6 * end.turn_angle[0], rel=1e-8)
+    assert end.turn_angle[0] > 0.005
 
 
 @pytest.mark.parametrize('arm', [(0.0, 0.8, 0.0), (0.3, -0.8, -0.3)])
@@ -178,4 +178,4 @@ def test_any_times_give_the_same_states():
     alone = motion.at(t)
     pick = np.searchsorted(whole.t, t)
     assert np.array_equal(whole.latitude[pick], alone.latitude)
-    assert np.array_equal(whole.turned[pick], alone.turned)
+    assert np.array_equal(whole.turn_angle[pick], alone.turn_angle)

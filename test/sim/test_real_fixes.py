@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.sim import motion, real_sensors, sensors
-from odocal_ros.sim.motion import point
+from odocal_ros.sim.motion import point_geodetic
 from odocal_ros.sim.noise import PHASE, stamps
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real_effects import RealEffects
@@ -89,7 +89,7 @@ def test_the_antenna_moves_with_the_roll_of_the_body():
                                   real=RealEffects(body_roll=0.01)))
     motion, t = motion_of(options), np.arange(20.0, 190.0, 0.5)
     leaning = real_sensors.positions(motion, t, options)
-    stiff = point(motion.at(t), options.antenna_lever_arm)
+    stiff = point_geodetic(motion.at(t), options.antenna_lever_arm)
     aside = np.hypot(leaning[0] - stiff[0],
                      (leaning[1] - stiff[1]) * np.cos(options.latitude)) * 6.37e6
     state = motion.at(t)

@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_quat, matrix_from_rpy, wrap
 from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim import sensors
-from odocal_ros.sim.motion import attitude, inertial_v, Motion, Start
+from odocal_ros.sim.motion import attitude, Motion, rigid_imu_output, Start
 from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, random_walk, stamps, white
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.profile import chain, hold, ramp
@@ -114,7 +114,7 @@ def test_a_perfect_imu_measures_the_motion_in_its_mounted_axes():
                                mounting_rpy=(np.pi, 0.0, 0.0), imu_lever_arm=(1.0, 0.5, 0.2)))
     drive = simulate(options)
     t = (drive.imu.stamp_ns - options.start_ns) * 1e-9
-    w_v, f_v = inertial_v(drive.motion.at(t), options.imu_lever_arm)
+    w_v, f_v = rigid_imu_output(drive.motion.at(t), options.imu_lever_arm)
     C_vi = matrix_from_rpy([0.05, -0.1, 0.3]) @ np.diag([1.0, -1.0, -1.0])
     # rounding of 10 m/s^2
     assert_allclose(drive.imu.f_i @ C_vi.T, f_v, atol=1e-14)

@@ -36,7 +36,7 @@ def test_skid_wheels_turn_by_the_effective_width_on_the_spot():
     state, rolled = paths(made)
     spot = (state.speed == 0.0) & (state.yaw_rate != 0.0)
     difference = np.diff(rolled['right_wheel_joint'] - rolled['left_wheel_joint'])
-    turns = np.diff(state.turned)
+    turns = np.diff(state.turn_angle)
     assert wheels.effective_width(made.options) == pytest.approx(wheels.SPOT_RATIO * 0.3)
     both = spot[:-1] & spot[1:]
     assert_allclose(difference[both], wheels.SPOT_RATIO * 0.3 * turns[both], rtol=1e-9, atol=1e-12)
@@ -53,7 +53,7 @@ def test_mecanum_wheels_obey_their_kinematics_and_move_sideways():
     assert_allclose((fl + fr + rl + rr) / 4, state.travel, atol=1e-9)
     assert_allclose((-fl + fr + rl - rr) / 4, lateral / wheels.LATERAL_RATIO, atol=1e-9)
     assert_allclose((-fl + fr - rl + rr) / 4,
-                    wheels.effective_width(made.options) / 2 * state.turned, atol=1e-9)
+                    wheels.effective_width(made.options) / 2 * state.turn_angle, atol=1e-9)
     made = robot(drive='mecanum', reference='mocap')
     path = np.linalg.norm(np.diff(made.positions()[:, :2][::10], axis=0), axis=1).sum()
     assert path > 1.2 * made.truth.distance
@@ -67,7 +67,7 @@ def test_omni_wheels_obey_their_kinematics(count):
     rows = np.stack([np.sin(angle), -np.cos(angle), -0.15 * np.ones(count)], -1)
     motion, *_ = np.linalg.lstsq(rows, np.stack(list(rolled.values())), rcond=None)
     lateral = np.append(0.0, np.cumsum(0.01 * (state.sway[1:, 0] + state.sway[:-1, 0]) / 2))
-    assert_allclose(motion, [state.travel, lateral, state.turned], atol=1e-9)
+    assert_allclose(motion, [state.travel, lateral, state.turn_angle], atol=1e-9)
     assert np.ptp(lateral) > 1.0
 
 
@@ -107,8 +107,8 @@ def test_wheels_without_steering_differ_by_the_turn_and_their_scale(count):
     state = drive.motion.at((drive.odometer.stamp_ns - drive.options.start_ns) * 1e-9)
     for wheel, samples in zip(wheels.wheels_of(drive.options), drive.wheels, strict=True):
         rolled = (samples.value - samples.value[0]) * wheel.scale
-        np.testing.assert_allclose(
-            rolled, state.travel - wheel.arm[1] * (state.turned - state.turned[0]), atol=1e-9)
+        turn = state.turn_angle - state.turn_angle[0]
+        np.testing.assert_allclose(rolled, state.travel - wheel.arm[1] * turn, atol=1e-9)
 
 
 def test_a_steered_wheel_rolls_along_its_own_curve():
@@ -116,13 +116,13 @@ def test_a_steered_wheel_rolls_along_its_own_curve():
     t = np.arange(0.0, drive.options.duration, 0.001)
     state = drive.motion.at(t)
     wheel = wheels.wheels_of(drive.options)[0]
-    along, turn = np.gradient(state.travel, t), np.gradient(state.turned, t)
+    along, turn = np.gradient(state.travel, t), np.gradient(state.turn_angle, t)
     speed = np.hypot(along - wheel.arm[1] * turn, wheel.arm[0] * turn)
     path = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))
     sent = drive.wheels[0]
     rolled = (sent.value - sent.value[0]) * wheel.scale
     at = (sent.stamp_ns - drive.options.start_ns) * 1e-9
-    assert np.ptp(state.turned) > 1.0
+    assert np.ptp(state.turn_angle) > 1.0
     # derivatives by differences over 1 ms have errors of some ppm
     np.testing.assert_allclose(rolled, np.interp(at, t, path), atol=0.01)
     assert rolled[-1] - state.travel[-1] > 0.5        # m: far above that
