@@ -28,8 +28,8 @@ def forecast(seed):
     from odocal_ros.forecast.planned_indoor import predict_robot
     from odocal_ros.library.plan_indoor import motion_of_drive, ratio_sigma, robot_of
     from odocal_ros.settings.config import Config, with_settings
-    from odocal_ros.sim.options import resolved
-    options = resolved(indoor.options_of(seed))
+    from odocal_ros.sim.options import resolve
+    options = resolve(indoor.options_of(seed))
     config = with_settings(Config(), {'imu.grade': options.imu_grade})
     found = predict_robot(motion_of_drive(options), robot_of(options), config)
     sigma = {key: None if (one := found.estimates.get(name)) is None or one.value is None

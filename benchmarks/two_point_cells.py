@@ -47,7 +47,7 @@ class Cell:
         from odocal_ros.sim import scenarios, sensors
         from odocal_ros.sim.motion import contact_travel
         from odocal_ros.sim.noise import PHASE, stamps
-        self.options = scenarios.resolved(scenarios.SimOptions(
+        self.options = scenarios.resolve(scenarios.SimOptions(
             scenario=scenario, imu_grade=grade, fix_noise=noise, **RATES))
         clean = dataclasses.replace(self.options, imu_grade='perfect', fix_sigma=0.0)
         self.motion = scenarios.motion_of(self.options)

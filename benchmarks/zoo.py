@@ -87,8 +87,8 @@ def run_drive(seed, duration=None):
 
 def compact(options):
     """Return the drawn values that differ from a plain drive, to four digits."""
-    from odocal_ros.sim.options import resolved, SimOptions
-    plain = asdict(resolved(SimOptions(scenario=options.scenario, odometer=options.odometer)))
+    from odocal_ros.sim.options import resolve, SimOptions
+    plain = asdict(resolve(SimOptions(scenario=options.scenario, odometer=options.odometer)))
     drawn = asdict(options)
     plain, drawn = plain | plain.pop('real'), drawn | drawn.pop('real')
     return {name: short(value) for name, value in drawn.items()

@@ -71,9 +71,9 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
 
 def from_scenario(name: str, duration: float | None) -> PlannedDrive:
     """Return the drive of a simulated scenario; duration: s, None: that of the scenario."""
-    from odocal_ros.sim.options import resolved, SimOptions
+    from odocal_ros.sim.options import resolve, SimOptions
     from odocal_ros.sim.scenarios import motion_of
-    options = resolved(SimOptions(scenario=name) if duration is None
+    options = resolve(SimOptions(scenario=name) if duration is None
                        else SimOptions(scenario=name, duration=duration))
     motion = motion_of(options)
     t = np.union1d(np.arange(0.0, motion.duration, max(DRIVE_STEP, motion.duration / 50_000)),

@@ -13,19 +13,19 @@ from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.scenarios import Drive, SimOptions
 
 WALK = 1e-4              # judgement: random walk of the scale, relative, per square root of a day
-# judgement: shares of the vehicles whose tyres are changed, IMU moved, counter broken; at least
-# one of three
+# judgement: shares of the vehicles of which a value changes; if there are three or more vehicles,
+# at least one for each value
 CHANGE_SHARES = {'scale_factor': 0.1, 'yaw_mounting_angle': 0.05, 'counter': 1 / 30}
 
 
 @dataclass(frozen=True)
 class Model:
-    """A kind of vehicle: nominal and true scale, m/pulse; mounting angles, rad."""
+    """A kind of vehicle."""
 
     name: str
-    nominal: float
-    scale: float
-    yaw: float
+    nominal_scale: float    # m/pulse, as configured
+    scale: float            # m/pulse, true mean of its vehicles
+    yaw: float              # rad, mean mounting angles of their IMUs
     pitch: float
 
 
@@ -40,7 +40,7 @@ class FleetChange:
     """A change of a vehicle before one of its bags, which count from 0."""
 
     bag: int
-    value: str           # its name: scale_factor, yaw_mounting_angle or counter
+    value: str           # name of the value: scale_factor, yaw_mounting_angle or counter
     size: float = 0.0    # relative, or rad
 
 
@@ -64,17 +64,17 @@ class FleetVehicle:
 def fleet_of(vehicles: int, bags: int, seed: int) -> list[FleetVehicle]:
     """Return ``vehicles`` vehicles with ``bags`` drives each, one per week."""
     order = make_rng(seed, 'fleet').permutation(vehicles).tolist()
-    changed: dict[int, str] = {}
+    changes: dict[int, str] = {}      # vehicle -> value
     for value, share in CHANGE_SHARES.items():
         for _ in range(math.ceil(vehicles * share - 1e-9) if vehicles > 2 and bags > 2 else 0):
-            changed[order.pop()] = value
-    return [_vehicle(number, bags, changed.get(number), make_rng(seed, f'fleet vehicle {number}'))
+            changes[order.pop()] = value
+    return [_vehicle(number, bags, changes.get(number), make_rng(seed, f'fleet vehicle {number}'))
             for number in range(vehicles)]
 
 
-def _vehicle(number: int, bags: int, changed: str | None,
+def _vehicle(number: int, bags: int, changing_value: str | None,
              rng: np.random.Generator) -> FleetVehicle:
-    """Return a vehicle; changed : name of the value that changes before one of its bags."""
+    """Return a vehicle; changing_value : its name, if a value changes before one of the bags."""
     model = MODELS[number % len(MODELS)]
     walk = np.cumsum(WALK * math.sqrt(7) * rng.standard_normal(bags))
     # between vehicles of a model, 1 sigma: 0.3 % of the scale, 0.3 and 0.2 deg
@@ -84,26 +84,26 @@ def _vehicle(number: int, bags: int, changed: str | None,
     odometer_km = 1000.0 + 400.0 * np.cumsum(rng.uniform(0.5, 1.5, bags))    # 400 km a week
     first_bag = int(rng.integers(1, max(2, bags - 1)))
     size = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.0))
-    changes: tuple[FleetChange, ...] = ()
-    if changed == 'scale_factor':
+    if changing_value == 'scale_factor':
         size *= 0.02
         scale[first_bag:] *= 1 + size
-    elif changed == 'yaw_mounting_angle':
+    elif changing_value == 'yaw_mounting_angle':
         size *= math.radians(3.0)
         yaw[first_bag:] += size
-    if changed:
-        changes = (FleetChange(first_bag, changed, 0.0 if changed == 'counter' else size),)
+    else:
+        size = 0.0
+    changes = (FleetChange(first_bag, changing_value, size),) if changing_value else ()
     return FleetVehicle(f'{model.name}_{number + 1:03d}', model, scale, yaw, pitch, odometer_km,
                         changes)
 
 
 def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOptions) -> SimOptions:
-    """Return the options of a vehicle's drive; number, bag: of both, from 0."""
+    """Return the options of a drive; number, bag : of the vehicle and of its drive, from 0."""
     return replace(
         options, seed=options.seed + 1000 * (number + 1) + bag, yaw=float(vehicle.yaw[bag]),
         start_ns=options.start_ns + bag * 7 * DAY_NS + number % 100 * DAY_NS // 24,
         pitch=vehicle.pitch, scale=float(vehicle.scale[bag]),
-        nominal_scale=vehicle.model.nominal)
+        nominal_scale=vehicle.model.nominal_scale)
 
 
 def with_broken_counter(drive: Drive) -> Drive:

@@ -3,12 +3,12 @@
 
 """Sample times, a random generator for each sensor, and processes of noise and drift."""
 
-from typing import Any
 import zlib
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.sim.options import SimOptions
 
 # s from the first IMU sample, so that no two topics sample together
 PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004, 'pressure': 0.005}
@@ -17,7 +17,7 @@ TRANSPORT_DELAY = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from mea
 
 
 def make_rng(seed: int, name: str) -> np.random.Generator:
-    """Return the named generator of a seed; settings of one sensor do not affect another's."""
+    """Return a generator by seed and name, so that options of one sensor affect no other one."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
@@ -48,13 +48,18 @@ def gauss_markov(rng: np.random.Generator, sigma: float, tau: float, t: Floats) 
 
 
 def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floats]:
-    """Return sample times: whole ns from the start (n,), and the same in s."""
+    """Return sample times at a rate, Hz, from a phase, s: whole ns (n,), and the same in s."""
     n = int(np.floor((duration - phase) * rate + 1e-9)) + 1
     ns = np.rint(phase * 1e9 + np.arange(n) * (1e9 / rate)).astype(np.int64)
     return ns, ns * 1e-9
 
 
-def reference_drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
+def arrival_ns(stamp: Ints, topic: str) -> Ints:
+    """Return the arrival times of messages with given stamps, ns: (n,)."""
+    return stamp + round(TRANSPORT_DELAY[topic] * 1e9)
+
+
+def reference_drift(t: Floats, travel: Floats, options: SimOptions) -> Floats | float:
     """Return errors (n, 3) m, ENU, that change with travel (n,), m, and jump at loop closures."""
     if not options.reference_drift:
         return 0.0
@@ -75,6 +80,6 @@ def reference_drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
     return errors
 
 
-def stationary_sigma(options: Any) -> float:
+def stationary_sigma(options: SimOptions) -> float:
     """Return the stationary sigma of a correlated drift, m; 0 for a random walk."""
     return float(options.reference_drift * np.sqrt(options.drift_length / 2))

@@ -21,7 +21,7 @@ SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
 ODOMETERS = ('counts', 'speed', 'angle')
 MAX_WHEEL_TOPICS, MAX_WHEELS = 2, 8    # definition: as in odometer.wheels
-BY_SCENARIO: Any = None   # filled in by ``resolved``
+BY_SCENARIO: Any = None   # filled in by ``resolve``
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0,
           'pitch': 45.0, 'roll': 180.0, 'orientation_sigma': 90.0, 'heading_sigma': 90.0}
 
 
-def resolved(options: SimOptions) -> SimOptions:
+def resolve(options: SimOptions) -> SimOptions:
     """Return options with the scenario's own values; BadUsage for a wrong name or value."""
     _check_choice('--scenario', options.scenario, DEFAULTS)
     _check_choice('--odometer', options.odometer, ODOMETERS)

@@ -9,6 +9,7 @@ it, multipath, tunnels; and its published velocity.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,15 +18,16 @@ from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.geodesy import radii
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point_geodetic
-from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, stamps, TRANSPORT_DELAY
+from odocal_ros.sim.noise import arrival_ns, gauss_markov, make_rng, PHASE, stamps
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real_effects import RealEffects
 
 # physical: frequency, Hz, width, Hz, and relative power of wheel hop and of the engine
 RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
 MIN_GAP_NS = 50_000    # judgement: between the stamps of one batch
-# definition: ages of positions in a filter, in time constants: the nodes of two-point Gauss rules
-# on pieces, short enough for the corners of a route; and the lengths of the pieces, half each
+# definition: a filter gives a weighted mean of past positions. AGES of these, in time constants,
+# are the nodes of two-point Gauss rules on the intervals between AGE_EDGES, which are short enough
+# for the corners of a route; AGE_LENGTHS: half of the length of the interval of each
 AGE_EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
                             np.arange(20.0, 41.0, 4.0)])
 AGES = (AGE_EDGES[:-1, None] + np.diff(AGE_EDGES)[:, None] * (
@@ -44,7 +46,16 @@ HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e
 OUTLIER_SIGMA = 5.0     # m/s, judgement: a wrong Doppler in a street
 
 
-def angles(d_b: Floats) -> tuple[float, float]:
+class MountingAngles(NamedTuple):
+    """Mounting angles of an IMU, rad: of the sensor axes, and of the housing b."""
+
+    yaw: float
+    pitch: float
+    yaw_housing: float
+    pitch_housing: float
+
+
+def forward_angles(d_b: Floats) -> tuple[float, float]:
     """Return yaw and pitch mounting angle for the forward axis of the vehicle in b, (3,), rad."""
     d = np.asarray(d_b, dtype=float)
     return float(-np.arcsin(d[1])), float(np.arctan2(d[2], d[0]))
@@ -68,11 +79,11 @@ def sensor_axes(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
 
 
 def mounting_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
-                    accel_matrix: Floats) -> tuple[float, float, float, float]:
-    """Return yaw and pitch of the sensor axes, then of the housing b, rad; matrices : in i."""
+                    accel_matrix: Floats) -> MountingAngles:
+    """Return the mounting angles for given rotations; matrices : as RealEffects, in i."""
     d = np.asarray(C_vb)[0]
     R = sensor_axes(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
-    return *angles(R.T @ d), *angles(d)
+    return MountingAngles(*forward_angles(R.T @ d), *forward_angles(d))
 
 
 def with_triad_errors(w_i: Floats, f_i: Floats, real: RealEffects) -> tuple[Floats, Floats]:
@@ -152,11 +163,11 @@ def positions(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, F
     real, true = options.real, _antenna(motion, t, options)
     position = true
     if real.receiver_lag:
-        position = _filtered(motion, t, options, FIRST_ORDER, real.receiver_lag)
+        position = _filter_positions(motion, t, options, FIRST_ORDER, real.receiver_lag)
     if real.receiver_tracking:
-        position = _filtered(motion, t, options, SECOND_ORDER, real.receiver_tracking)
+        position = _filter_positions(motion, t, options, SECOND_ORDER, real.receiver_tracking)
     if real.receiver_odometer:
-        corrected = _filtered(motion, t, options, FIRST_ORDER, real.receiver_odometer_time)
+        corrected = _filter_positions(motion, t, options, FIRST_ORDER, real.receiver_odometer_time)
         latitude, longitude, height = (
             x + real.receiver_odometer * (x_true - x_corrected)
             for x, x_true, x_corrected in zip(position, true, corrected, strict=True))
@@ -164,10 +175,10 @@ def positions(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, F
     return position
 
 
-def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
-              time: float) -> tuple[Floats, Floats, Floats]:
-    """Return filtered positions, with weights of AGES and a time constant, s; first at rest."""
-    past = [_antenna(motion, np.maximum(t - time * age, 0.0), options) for age in AGES]
+def _filter_positions(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
+                      tau: float) -> tuple[Floats, Floats, Floats]:
+    """Return filtered positions; weights : of AGES.   tau : time constant, s."""
+    past = [_antenna(motion, np.maximum(t - tau * age, 0.0), options) for age in AGES]
     latitude, longitude, height = (
         sum(w * x for w, x in zip(weights, coordinate, strict=True))
         for coordinate in zip(*past, strict=True))
@@ -186,6 +197,7 @@ def fused_errors(t: Floats, errors: Floats, options: SimOptions) -> Floats:
 
 
 def _antenna(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
+    """Return the true latitude and longitude, rad, and height, m, of the antenna at times t."""
     tilt = body.rotation(motion, t) if motion.tilt else None
     return point_geodetic(motion.at(t), options.antenna_lever_arm, tilt)
 
@@ -195,8 +207,8 @@ def position_errors(t: Floats, options: SimOptions) -> Floats | float:
     real = options.real
     total: Floats | float = 0.0
     for k, (sigma, tau) in enumerate(real.slow_errors):
-        slow = gauss_markov(make_rng(options.seed, f'real slow {k}'), sigma, tau, t)
-        total = total + slow * [1.0, 1.0, UP_RATIO]
+        errors = gauss_markov(make_rng(options.seed, f'real slow {k}'), sigma, tau, t)
+        total = total + errors * [1.0, 1.0, UP_RATIO]
     return total + burst_errors(t, options) if real.bursts else total
 
 
@@ -223,10 +235,10 @@ def tunnel_errors(t: Floats, error: Floats, position: Floats, options: SimOption
         if len(inside) < 2:
             continue
         steps = np.diff(position[inside], axis=0, prepend=position[inside[:1]])
-        turned = real.tunnel_heading * (t[inside, None] - begin) / 60
-        sideways = np.stack([-steps[:, 1], steps[:, 0], 0 * steps[:, 2]], -1)
+        heading_error = real.tunnel_heading * (t[inside, None] - begin) / 60
+        steps_left = np.stack([-steps[:, 1], steps[:, 0], 0 * steps[:, 2]], -1)
         out[inside] = error[inside[0]] + np.cumsum(
-            real.tunnel_odometer * steps + turned * sideways, axis=0)
+            real.tunnel_odometer * steps + heading_error * steps_left, axis=0)
     return out
 
 
@@ -245,12 +257,12 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     north, east, up = ((after - before) / (2 * HALF_STEP)).T
     true = np.stack([east * (normal + height) * np.cos(latitude), north * (meridian + height), up],
                     -1)
-    time, rng = options.velocity_correlation_time, make_rng(options.seed, 'velocity')
-    error = (gauss_markov(rng, sigma, time, t) if time
+    tau, rng = options.velocity_correlation_time, make_rng(options.seed, 'velocity')
+    error = (gauss_markov(rng, sigma, tau, t) if tau
              else sigma * rng.standard_normal((len(t), 3)))
     is_outlier = rng.uniform(size=(len(t), 1)) < options.velocity_outliers
     published = true * (1 + options.velocity_scale_error) + (
         error + is_outlier * OUTLIER_SIGMA * rng.standard_normal((len(t), 3)))
     stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
-    return VelocitySamples(stamp, stamp + round(TRANSPORT_DELAY['fix'] * 1e9), published,
+    return VelocitySamples(stamp, arrival_ns(stamp, 'fix'), published,
                            np.full(published.shape, sigma**2))

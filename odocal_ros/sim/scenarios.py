@@ -19,9 +19,9 @@ from odocal_ros.settings.config import HOLONOMIC
 from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, NO_SWAY, Start
 from odocal_ros.sim.noise import make_rng, stamps
-from odocal_ros.sim.options import DEFAULTS, Reference, REFERENCES, resolved, SimOptions
+from odocal_ros.sim.options import DEFAULTS, Reference, REFERENCES, resolve, SimOptions
 from odocal_ros.sim.profile import hermite, Hills, Profile
-from odocal_ros.sim.real_sensors import mounting_angles, velocity
+from odocal_ros.sim.real_sensors import mounting_angles, MountingAngles, velocity
 from odocal_ros.sim.routes import Route, ROUTES, with_sideways_moves
 from odocal_ros.sim.wheels import leg_factor, wheels_of
 
@@ -123,19 +123,15 @@ def motion_of(options: SimOptions) -> Motion:
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
     real = options.real
-    optional: dict[str, Any] = {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
     lean = (body.road_lean(route.speed, route.yaw_rate, real)
             if real.alternating_crossfall or real.banking or real.constant_crossfall else None)
-    if lean:
-        optional['lean'] = lean
-    if route.side is not None:
-        optional['sway'] = route.side, NO_SWAY
-    elif options.sway or real.sideslip or lean:
-        optional['sway'] = _sway(route, options, lean)
-    if real.squat or real.body_roll or real.wheelbase or real.kneeling or lean:
-        optional['tilt'] = body.tilts(route.speed, route.yaw_rate, real, hills, lean)
-    return Motion(route.speed, route.yaw_rate, start, hills, **optional)
+    sway = route.side or NO_SWAY, NO_SWAY
+    if route.side is None and (options.sway or real.sideslip or lean):
+        sway = _sway(route, options, lean)
+    has_springs = real.squat or real.body_roll or real.wheelbase or real.kneeling or lean
+    tilt = body.tilts(route.speed, route.yaw_rate, real, hills, lean) if has_springs else ()
+    return Motion(route.speed, route.yaw_rate, start, hills, sway, tilt, lean)
 
 
 def _kerbs(route: Route, options: SimOptions) -> tuple[tuple[float, float], ...]:
@@ -160,24 +156,24 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     if options.real.sideslip:
         # to the left, against the force of the tyres
         force = body.side_force(route.speed, route.yaw_rate, lean, breaks)
-        side = _sum(side, -options.real.sideslip * force * np.abs(route.speed(breaks)))
+        side = _add_velocity(side, -options.real.sideslip * force * np.abs(route.speed(breaks)))
     if lean:
         phi, rate = lean(breaks), lean.derivative()(breaks) * options.odometer_lever_arm[2]
-        side, up = _sum(side, rate * np.cos(phi)), _sum(up, rate * np.sin(phi))
+        side, up = _add_velocity(side, rate * np.cos(phi)), _add_velocity(up, rate * np.sin(phi))
     return side, up
 
 
-def _sum(sway: Profile, velocity_at_breaks: Floats) -> Profile:
-    """Return the sum of a velocity and another at its breaks, cubic between them."""
+def _add_velocity(sway: Profile, velocity_at_breaks: Floats) -> Profile:
+    """Return the sum of a sway and a velocity, m/s at its breaks, cubic between them."""
     t = sway.breaks
     added = hermite(t, velocity_at_breaks, np.gradient(velocity_at_breaks, t)).powers
-    lacking = added.shape[1] - sway.powers.shape[1]
-    return Profile(t, added + np.pad(sway.powers, ((0, 0), (0, lacking))))
+    higher_orders = added.shape[1] - sway.powers.shape[1]
+    return Profile(t, added + np.pad(sway.powers, ((0, 0), (0, higher_orders))))
 
 
 def simulate(options: SimOptions | None = None) -> Drive:
     """Return a drive; equal options give equal drives, to the last bit."""
-    options = resolved(options or SimOptions())
+    options = resolve(options or SimOptions())
     motion = motion_of(options)
     imu = sensors.imu(motion, options)
     return Drive(
@@ -192,6 +188,7 @@ def simulate(options: SimOptions | None = None) -> Drive:
 
 
 def _truth(motion: Motion, options: SimOptions, imu: samples.ImuSamples) -> Truth:
+    """Return the true values of a drive; imu: its samples, for the stamps of the marks."""
     gyro_bias, accel_bias = sensors.turn_on_biases(options)
     _, t = stamps(motion.duration, options.imu_rate)    # true times, not stamps
     first_move = motion.speed.breaks[np.argmax((motion.speed.powers != 0).any(axis=1))]
@@ -203,22 +200,21 @@ def _truth(motion: Motion, options: SimOptions, imu: samples.ImuSamples) -> Trut
     at_starts = sensors.slip(state, replace(options, slip_walk=0.0, slip_events=0.0))
     factor = leg_factor(state, options.real, at_starts)
     scale = options.scale * factor
-    yaw, pitch, yaw_housing, pitch_housing = _angles(options)
     return Truth(
         scale=scale, scale_ratio=scale / options.nominal_scale,
         wheel_scales=tuple(factor * wheel.scale for wheel in wheels_of(options)),
-        yaw=yaw, pitch=pitch, yaw_housing=yaw_housing, pitch_housing=pitch_housing,
+        **_mounting_angles(options)._asdict(),
         heading=float(heading_from_yaw(np.arctan2(x_n[1], x_n[0]))), distance=motion.distance,
         start_ns=int(imu.stamp_ns[start]), stop_ns=int(imu.stamp_ns[-1]),
         gyro_bias=gyro_bias, accel_bias=accel_bias)
 
 
-def _angles(options: SimOptions) -> tuple[float, float, float, float]:
-    """Return yaw and pitch by the IMU's own axes, then by its housing, rad."""
+def _mounting_angles(options: SimOptions) -> MountingAngles:
+    """Return the true mounting angles."""
     real = options.real
     gyro, accel = real.matrix('gyro_matrix'), real.matrix('accel_matrix')
     if not (options.roll or gyro.any() or accel.any()):
-        return (options.yaw, options.pitch) * 2
+        return MountingAngles(options.yaw, options.pitch, options.yaw, options.pitch)
     # with a roll the angles are those of forward: docs/conventions.md
     return mounting_angles(matrix_from_rpy([options.roll, options.pitch, options.yaw]),
                            matrix_from_rpy(options.mounting_rpy), gyro, accel)

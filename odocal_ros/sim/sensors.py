@@ -27,6 +27,8 @@ from odocal_ros.sim.real_effects import ZEROS3
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
 WHITE_SHARE = 0.2        # judgement: white receiver noise over the sigma of correlated errors
 SIGMA_FLOOR = 0.001      # m, judgement: no receiver reports zero
+# format: COVARIANCE_TYPE_DIAGONAL_KNOWN and STATUS_GBAS_FIX of sensor_msgs/NavSatFix
+DIAGONAL_KNOWN, RTK_STATUS = 2, 2
 MOTION_LIMIT = 1e-9      # m/s and rad/s, judgement
 
 
@@ -81,9 +83,8 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
         ns = real_sensors.delayed_stamps(ns, noise.make_rng(options.seed, 'real imu stamps'),
                                          real.imu_latency, real.imu_jitter, real.imu_batch)
     stamp = options.start_ns + ns
-    return samples.ImuSamples(
-        stamp, stamp + round(noise.TRANSPORT_DELAY['imu'] * 1e9), w_i + gyro + gyro_drift,
-        f_i + accel + accel_drift, q_ni, variance)
+    return samples.ImuSamples(stamp, noise.arrival_ns(stamp, 'imu'), w_i + gyro + gyro_drift,
+                              f_i + accel + accel_drift, q_ni, variance)
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.HeadingSamples:
@@ -91,9 +92,8 @@ def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.Headin
     ns, t = noise.stamps(motion.duration, options.heading_rate, noise.PHASE['heading'])
     q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=ZEROS3), sigma, 'heading')
     stamp = options.start_ns + ns
-    return samples.HeadingSamples(
-        stamp, stamp + round(noise.TRANSPORT_DELAY['heading'] * 1e9), q_nb,
-        np.full(len(t), sigma**2))
+    return samples.HeadingSamples(stamp, noise.arrival_ns(stamp, 'heading'), q_nb,
+                                  np.full(len(t), sigma**2))
 
 
 def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
@@ -125,7 +125,7 @@ def odometers(motion: Motion, options: SimOptions) -> list[samples.OdometerSampl
     state = motion.at(t)
     stamp = options.start_ns + _delayed(ns, options, 'odometer')
     lean = motion.lean(t) if motion.lean else 0.0
-    return [samples.OdometerSamples(stamp, stamp, _reading(state, options, wheel, lean))
+    return [samples.OdometerSamples(stamp, stamp, _odometer_values(state, options, wheel, lean))
             for wheel in wheels.wheels_of(options)]
 
 
@@ -140,11 +140,12 @@ def _delayed(ns: Ints, options: SimOptions, name: str) -> Ints:
     return real_sensors.delayed_stamps(ns, rng, delay, jitter)
 
 
-def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
-             lean: Floats | float) -> Floats | Ints:
+def _odometer_values(state: State, options: SimOptions, wheel: wheels.SimWheel,
+                     lean: Floats | float) -> Floats | Ints:
+    """Return pulses, speeds or angles of a wheel, (n,); lean : of the road, rad."""
     arm, scale, real = wheel.arm, wheel.scale, options.real
     slip_path = slip(state, options, wheel.stream)
-    radius_ratio = 1 + wheels.tyre_growth(state, real)      # to a cold, slow tyre
+    radius_ratio = 1 + wheels.tyre_growth(state, real)      # over that of a cold, slow tyre
     if options.odometer == 'speed':
         rng = noise.make_rng(options.seed, 'speed')
         error = options.speed_noise * rng.standard_normal(len(state.t))
@@ -152,59 +153,58 @@ def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
         slip_speed = wheels.slip_share(state, real) * state.speed
         rate = (contact_speed(state, arm, lean) + slip_speed
                 + np.gradient(slip_path, state.t)) / radius_ratio
-        sent = wheels.low_passed(rate + error, state.t, real.speed_filter)
-        return wheels.quantized(sent / scale, real)
+        sent = wheels.low_pass_speed(rate + error, state.t, real.speed_filter)
+        return wheels.published_speed(sent / scale, real)
     path = (contact_travel(state, arm, lean) if options.drive == DIFFERENTIAL else
             wheels.robot_path(state, options, wheel))
     rolled = path + slip_path + wheels.tyre_slip(state, real)
     if wheel.steered:
         rolled = rolled + wheels.steered_path(state, arm)
     if np.ndim(radius_ratio):
-        mean_ratio = (radius_ratio + np.roll(radius_ratio, 1)) / 2      # of each step
+        mean_ratio = (radius_ratio + np.roll(radius_ratio, 1)) / 2      # of both ends of a step
         rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / mean_ratio)
     rolled = rolled / scale
-    # angle of the disc
+    # position of the pulse disc at the start, in pulses or radians
     phase = noise.make_rng(options.seed, f'pulse phase {wheel.stream}').uniform()
     if options.odometer == 'angle':
         return rolled + phase
     return FIRST_COUNT + np.floor(rolled + phase).astype(np.int64)
 
 
-def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
-    """Return the accumulated slip of a wheel at each time, m: (n,)."""
-    length = np.zeros(len(state.t))
+def slip(state: State, options: SimOptions, stream: str = 'L') -> Floats:
+    """Return the accumulated slip of a wheel, m, (n,); stream : name of its random numbers."""
+    total = np.zeros(len(state.t))
     moving = (np.abs(state.speed) > MOTION_LIMIT) | (np.abs(state.yaw_rate) > MOTION_LIMIT)
     if options.drive in HOLONOMIC:
         moving |= np.abs(state.sway[:, 0]) > MOTION_LIMIT
     steps = np.diff(state.t, prepend=state.t[:1]) * moving
     if options.slip_walk:
-        walk = noise.make_rng(options.seed, f'slip walk {side}')
-        length += options.slip_walk * np.cumsum(np.sqrt(steps) * walk.standard_normal(len(length)))
+        walk = noise.make_rng(options.seed, f'slip walk {stream}')
+        total += options.slip_walk * np.cumsum(np.sqrt(steps) * walk.standard_normal(len(total)))
     if options.slip_events:     # each takes a second
-        rng = noise.make_rng(options.seed, f'slip events {side}')
+        rng = noise.make_rng(options.seed, f'slip events {stream}')
         spins = rng.poisson(options.slip_events * steps.sum() / 3600)
         for begin in rng.choice(state.t[moving], spins):
-            length += options.slip_size * np.clip(state.t - begin, 0.0, 1.0)
+            total += options.slip_size * np.clip(state.t - begin, 0.0, 1.0)
     if options.start_slip:
-        length += options.start_slip * _travel_after_starts(state, moving, options.start_slip_time)
-    return length
+        total += options.start_slip * _travel_after_starts(state, moving, options.start_slip_time)
+    return total
 
 
 def _travel_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
     """Return the accumulated travel within ``seconds`` s after each start, m: (n,)."""
     starts = np.flatnonzero(moving & ~np.roll(moving, 1)) - 1    # the last sample at rest
     starts = starts[starts >= 0]
-    since = np.searchsorted(starts, np.arange(len(moving)), side='right') - 1
     if not len(starts):
         return np.zeros(len(moving))
-    counted = (since >= 0) & (state.t - state.t[starts[since]] <= seconds + 1e-6)   # s, rounding
-    return np.cumsum(np.diff(state.travel, prepend=state.travel[:1]) * counted)
+    latest = np.searchsorted(starts, np.arange(len(moving)), side='right') - 1    # start up to now
+    is_near = (latest >= 0) & (state.t - state.t[starts[latest]] <= seconds + 1e-6)  # s, rounding
+    return np.cumsum(np.diff(state.travel, prepend=state.travel[:1]) * is_near)
 
 
 def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     """Return GNSS fixes of the antenna, without those in an outage."""
     ns, t = noise.stamps(motion.duration, options.fix_rate, noise.PHASE['fix'])
-    real = options.real
     latitude, longitude, height = real_sensors.positions(motion, t, options)
     error = fix_errors(t, options) + real_sensors.position_errors(t, options)
     error = error + noise.reference_drift(t, motion.at(t).travel, options)
@@ -217,29 +217,36 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     error = real_sensors.tunnel_errors(t, error, position, options)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
+    n = len(t)
+    stamp = options.start_ns + _delayed(ns, options, 'fix')
+    sent = samples.FixSamples(
+        stamp, noise.arrival_ns(stamp, 'fix'), latitude, longitude, height + error[:, 2],
+        np.tile(np.diag(_stated_variances(options)), (n, 1, 1)), np.full(n, DIAGONAL_KNOWN),
+        np.full(n, RTK_STATUS if options.fix_noise == 'rtk' else 0))
+    received = np.ones(n, dtype=bool)
+    for begin, end in options.outages:
+        received &= (t < begin) | (t >= end)
+    if options.real.drops:
+        draws = noise.make_rng(options.seed, 'real drops').uniform(size=n)
+        received &= draws >= options.real.drops
+    return samples.take(sent, received)
+
+
+def _stated_variances(options: SimOptions) -> Floats:
+    """Return the variances that the receiver states, east, north and up, m^2: without bursts."""
+    real = options.real
     variance_ratio = 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
     slow_variance = sum(sigma**2 for sigma, _ in real.slow_errors)
-    # of east, north and up, without bursts
     variance = (_axis_sigmas(options) ** 2 * variance_ratio + noise.stationary_sigma(options)**2
                 + slow_variance * np.array([1.0, 1.0, real_sensors.UP_RATIO**2]))
     variance = np.maximum(variance * real.stated_sigma_ratio**2, SIGMA_FLOOR**2)
     if REFERENCES[options.reference].is_planar:
         variance[2] = 0.0
-    n = len(t)
-    stamp = options.start_ns + _delayed(ns, options, 'fix')
-    sent = samples.FixSamples(
-        stamp, stamp + round(noise.TRANSPORT_DELAY['fix'] * 1e9), latitude, longitude,
-        height + error[:, 2], np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
-        np.full(n, 2 if options.fix_noise == 'rtk' else 0))
-    received = np.ones(n, dtype=bool)
-    for begin, end in options.outages:
-        received &= (t < begin) | (t >= end)
-    if real.drops:
-        received &= noise.make_rng(options.seed, 'real drops').uniform(size=n) >= real.drops
-    return samples.take(sent, received)
+    return variance
 
 
 def _axis_sigmas(options: SimOptions) -> Floats:
+    """Return the sigmas of fixes east, north and up, m."""
     return options.fix_sigma * np.array([1.0, 1.0, 2.0])
 
 
@@ -248,12 +255,12 @@ def fix_errors(t: Floats, options: SimOptions) -> Floats:
     draws = noise.make_rng(options.seed, 'fix white').standard_normal((len(t), 3))
     if options.fix_noise == 'correlated':
         slow = noise.gauss_markov(noise.make_rng(options.seed, 'fix slow'), 1.0,
-                            options.fix_correlation_time, t)
+                                  options.fix_correlation_time, t)
         draws = slow + WHITE_SHARE * draws
     errors = _axis_sigmas(options) * draws
     rng = noise.make_rng(options.seed, 'outliers')
-    share, bearing = rng.uniform(size=len(t)), rng.uniform(0, 2 * np.pi, len(t))
-    distance = options.outlier_size * rng.uniform(0.5, 1.5, len(t)) * (share < options.outliers)
-    errors[:, 0] += distance * np.cos(bearing)
-    errors[:, 1] += distance * np.sin(bearing)
+    is_outlier = rng.uniform(size=len(t)) < options.outliers
+    direction = rng.uniform(0, 2 * np.pi, len(t))
+    distance = options.outlier_size * rng.uniform(0.5, 1.5, len(t)) * is_outlier
+    errors[:, :2] += (distance * [np.cos(direction), np.sin(direction)]).T
     return errors

@@ -74,11 +74,11 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
                 positions, _scales(options, ~steered), steered.tolist(), strict=True)]
 
 
-def _scales(options: SimOptions, counted: Bools) -> list[float]:
-    """Return random scales of more than two wheels; counted : (n,) wheels in the mean."""
-    n = len(counted)
+def _scales(options: SimOptions, in_mean: Bools) -> list[float]:
+    """Return random scales of n wheels; in_mean : (n,) True for wheels of the mean count."""
+    n = len(in_mean)
     scales = 1 + options.wheel_difference * make_rng(options.seed, 'wheels').standard_normal(n)
-    scales *= options.scale * np.mean(1 / scales[counted])
+    scales *= options.scale * np.mean(1 / scales[in_mean])
     return [float(scale) for scale in scales]
 
 
@@ -152,7 +152,7 @@ def tyre_slip(state: State, real: RealEffects) -> Floats:
 
 
 def leg_factor(state: State, real: RealEffects, start_slip: Floats) -> float:
-    """Return the true path over that counted by a cold wheel; start_slip : (n,) m, so far."""
+    """Return the true path over the path counted by a cold wheel; start_slip : (n,) m, so far."""
     if not (real.speed_law or real.warming or real.tyre_slip or start_slip.any()):
         return 1.0
     path_length = np.diff(state.travel)
@@ -162,17 +162,17 @@ def leg_factor(state: State, real: RealEffects, start_slip: Floats) -> float:
     return float(np.abs(path_length).sum() / np.abs(counted).sum())
 
 
-def low_passed(speed: Floats, t: Floats, time: float) -> Floats:
-    """Return speeds after a first-order filter of a time constant, s; 0: none."""
-    if not time:
+def low_pass_speed(speed: Floats, t: Floats, tau: float) -> Floats:
+    """Return speeds after a first-order filter with a time constant tau, s; 0: none."""
+    if not tau:
         return speed
-    out, share = speed.tolist(), -np.expm1(-np.diff(t) / time)
+    out, share = speed.tolist(), -np.expm1(-np.diff(t) / tau)
     for k, a in enumerate(share.tolist(), 1):
         out[k] = out[k - 1] + a * (out[k] - out[k - 1])
     return np.array(out)
 
 
-def quantized(speed: Floats, real: RealEffects) -> Floats:
+def published_speed(speed: Floats, real: RealEffects) -> Floats:
     """Return the published speeds: in steps, 0 below the dead band, or held."""
     if real.speed_step:
         steps = np.abs(speed) / real.speed_step
@@ -180,13 +180,13 @@ def quantized(speed: Floats, real: RealEffects) -> Floats:
         speed = np.sign(speed) * steps * real.speed_step
     if real.dead_band:
         speed = np.where(np.abs(speed) < real.dead_band, 0.0, speed)
-    return held_until_step(speed, real.speed_hold) if real.speed_hold else speed
+    return hold_speed(speed, real.speed_hold) if real.speed_hold else speed
 
 
-def held_until_step(speed: Floats, step: float) -> Floats:
+def hold_speed(speed: Floats, step: float) -> Floats:
     """Return speeds, each held until the next is 0 or differs by a step."""
     out = speed.tolist()
-    for k, now in enumerate(out[1:], 1):
-        if now and abs(now - out[k - 1]) < step:
+    for k, value in enumerate(out[1:], 1):
+        if value and abs(value - out[k - 1]) < step:
             out[k] = out[k - 1]
     return np.array(out)

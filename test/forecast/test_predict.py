@@ -17,7 +17,7 @@ from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions, simulate
+from odocal_ros.sim.scenarios import motion_of, resolve, SimOptions, simulate
 from odocal_ros.sim.truth import operator_settings
 
 pytestmark = pytest.mark.slow
@@ -82,7 +82,7 @@ def test_effect_of_a_vertical_gyro_bias_is_that_of_the_mean_travel_time():
 @pytest.mark.parametrize('source', ['fixed', 'gyrocompass'])
 def test_the_prediction_is_the_sigma_of_the_result(scenario, source):
     grade = 'navigation' if source == 'gyrocompass' else 'tactical'
-    options = resolved(SimOptions(scenario=scenario, imu_grade=grade, imu_rate=20.0,
+    options = resolve(SimOptions(scenario=scenario, imu_grade=grade, imu_rate=20.0,
                                   odometer_rate=20.0, fix_rate=4.0, seed=5, pitch=0.0))
     drive = simulate(options)
     groups = operator_settings(drive, HEADING if source == 'fixed' else None)

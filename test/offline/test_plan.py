@@ -18,7 +18,7 @@ from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import drive_sources
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
+from odocal_ros.sim.scenarios import motion_of, resolve, SimOptions
 
 pytestmark = pytest.mark.slow
 PAPER = ['plan', '--scenario', 'paper', '--imu-grade', 'navigation']
@@ -101,7 +101,7 @@ def test_an_out_and_back_drive_needs_the_smoother(capsys):
     assert answer['verdict'] == 'rejected'
     assert answer['estimates']['scale_factor'] == {'sigma': None, 'method': None}
     half = next(c for c in answer['changes'] if 'the farthest point' in c['text'])
-    motion = motion_of(resolved(SimOptions(scenario='out_and_back')))
+    motion = motion_of(resolve(SimOptions(scenario='out_and_back')))
     t = np.arange(0.0, motion.duration, 0.1)
     moving = np.flatnonzero(np.abs(motion.speed(t)) > 1e-6)
     stop = t[moving[np.flatnonzero(np.diff(moving) > 100)[0]]]

@@ -13,7 +13,7 @@ from odocal_ros.forecast.planned_methods import predict_smoother
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.library import drive_sources
 from odocal_ros.offline.cli import main
-from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
+from odocal_ros.sim.scenarios import motion_of, resolve, SimOptions
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +35,7 @@ def test_a_drive_from_figures_has_these_figures():
 @pytest.mark.parametrize(('scenario', 'noise'), [('straight', 0.0), ('straight', 0.05),
                                                  ('town', 0.2)])
 def test_speed_steps_of_a_gpx_track_do_not_reduce_the_sigmas(tmp_path, scenario, noise):
-    motion = motion_of(resolved(SimOptions(scenario=scenario)))
+    motion = motion_of(resolve(SimOptions(scenario=scenario)))
     t = np.arange(0.0, motion.duration, 0.05)
     step = motion.speed(t) * 0.05 * np.exp(1j * np.cumsum(motion.yaw_rate(t) * 0.05))
     place = np.cumsum(step)[::20]      # a point a second
@@ -103,7 +103,7 @@ def test_the_plan_of_a_bag_uses_its_drive_and_fixes(tmp_path, capsys):
     answer = plan_of(capsys, '--bag', str(bag), '--imu-grade', 'industrial')
     assert answer['sigmas']['fix_sigma'] == pytest.approx(0.5, rel=1e-6)
     assert answer['sigmas']['fix_rate'] == pytest.approx(2.0, rel=1e-6)
-    motion = motion_of(resolved(SimOptions(scenario='straight', duration=200.0)))
+    motion = motion_of(resolve(SimOptions(scenario='straight', duration=200.0)))
     assert answer['drive']['distance'] == pytest.approx(motion.distance, rel=0.01)
     assert answer['drive']['standing'] == pytest.approx([60.0, 60.0], abs=1.5)
     assert answer['sigmas']['pulse'] == pytest.approx(0.0213, rel=0.02)     # its own counts

@@ -9,7 +9,7 @@ import pytest
 
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import attitude, Motion, Start, velocity_n
-from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.options import resolve, SimOptions
 from odocal_ros.sim.profile import chain, Hills, hold, ramp, turn
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
@@ -40,7 +40,7 @@ def test_slopes_are_derivatives_of_the_height_and_chords_are_means():
 
 def test_the_body_climbs_kerbs_with_both_axles():
     real = RealEffects(kerbs=0.08, kerb_distance=2.0, wheelbase=0.5)
-    motion = motion_of(resolved(SimOptions(scenario='yard', duration=120.0, real=real)))
+    motion = motion_of(resolve(SimOptions(scenario='yard', duration=120.0, real=real)))
     t = np.arange(0.0, 120.0, 0.05)
     state = motion.at(t)
     assert len(motion.hills.kerbs) > 3
@@ -64,7 +64,7 @@ def test_a_cross_slope_rolls_the_vehicle_and_gives_lateral_gravity():
 
 def test_the_wheel_contact_has_no_sideslip_in_a_banked_curve():
     real = RealEffects(banking=0.5)
-    options = resolved(SimOptions(scenario='oval', odometer_lever_arm=(0.0, 0.0, -0.3), real=real))
+    options = resolve(SimOptions(scenario='oval', odometer_lever_arm=(0.0, 0.0, -0.3), real=real))
     motion = motion_of(options)
     t = np.arange(40.0, 120.0, 0.05)
     state = motion.at(t)
@@ -80,7 +80,7 @@ def test_the_wheel_contact_has_no_sideslip_in_a_banked_curve():
 
 
 def test_an_oval_turns_left_by_half_a_turn_at_each_end_and_closes():
-    motion = motion_of(resolved(SimOptions(scenario='oval', seed=3)))
+    motion = motion_of(resolve(SimOptions(scenario='oval', seed=3)))
     assert motion.duration == 600.0
     t = np.arange(0.0, 600.0, 0.1)
     state = motion.at(t)
@@ -153,7 +153,7 @@ def test_the_imu_measures_the_motion_of_its_place_on_the_body():
 
 
 def test_rear_axle_sideslip_is_outwards_by_the_lateral_acceleration():
-    options = resolved(SimOptions(scenario='town', duration=200.0,
+    options = resolve(SimOptions(scenario='town', duration=200.0,
                                   real=RealEffects(sideslip=0.004)))
     motion = motion_of(options)
     state = motion.at(np.arange(0, 200, 0.1))      # where the sideslip is at the computed value
@@ -161,14 +161,14 @@ def test_rear_axle_sideslip_is_outwards_by_the_lateral_acceleration():
     assert np.abs(side).max() > 1
     assert_allclose(state.sway[:, 0], -0.004 * side * state.speed, atol=1e-12)
     assert (state.sway[:, 1] == 0).all()
-    assert_allclose(state.travel, motion_of(resolved(SimOptions(
+    assert_allclose(state.travel, motion_of(resolve(SimOptions(
         scenario='town', duration=200.0))).at(state.t).travel, atol=1e-9)
 
 
 def test_on_a_cross_slope_the_body_rolls_and_the_axle_slips_downhill():
     fall, straight = 0.025, {'scenario': 'straight', 'duration': 190.0}
     real = RealEffects(constant_crossfall=fall, body_roll=ROLL, sideslip=0.004)
-    motion = motion_of(resolved(SimOptions(**straight, odometer_lever_arm=(0.0, 0.0, 0.0),
+    motion = motion_of(resolve(SimOptions(**straight, odometer_lever_arm=(0.0, 0.0, 0.0),
                                            real=real)))
     t = np.arange(0.0, 190.0, 0.1)
     state, R = motion.at(t), body.rotation(motion, t)
@@ -180,7 +180,7 @@ def test_on_a_cross_slope_the_body_rolls_and_the_axle_slips_downhill():
 def test_a_bus_kneels_only_at_stops_within_the_drive():
     down = np.radians(2.0)
     options = SimOptions(scenario='town', duration=300.0, real=RealEffects(kneeling=down))
-    motion = motion_of(resolved(options))
+    motion = motion_of(resolve(options))
     t = np.arange(0.0, 300.0, 0.02)
     still = np.abs(motion.speed(t)) < 1e-9
     roll = motion.tilt[0](t)

@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.sim import motion, real_sensors, sensors
 from odocal_ros.sim.motion import point_geodetic
 from odocal_ros.sim.noise import PHASE, stamps
-from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.options import resolve, SimOptions
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
 
@@ -24,7 +24,7 @@ TAU = 0.8
 
 def north(drive, times):
     """Return the antenna position from a receiver without noise, m north of the start."""
-    options = resolved(drive)
+    options = resolve(drive)
     latitude, _, _ = real_sensors.positions(motion_of(options), np.asarray(times), options)
     return (latitude - options.latitude) * 6.36e6
 
@@ -65,7 +65,7 @@ def test_slow_errors_have_their_size_and_are_in_the_covariance():
     want = 0.3**2 + 1.2**2 + 0.9**2
     assert_allclose(drive.fix.covariance_n[0], 0.25 * np.diag([want, want, 4 * want]), rtol=1e-12)
     made = np.array([real_sensors.position_errors(np.arange(0.0, 600, 1.0), replace(
-        resolved(options), seed=s)) for s in range(60)])
+        resolve(options), seed=s)) for s in range(60)])
     # 60 drives of 600 s hold 60 * 600 / (2 * 20) independent draws of the slower one, each axis
     n = 60 * 600 / 40
     for axis, up in ((0, 1), (1, 1), (2, 4)):
@@ -75,7 +75,7 @@ def test_slow_errors_have_their_size_and_are_in_the_covariance():
 
 def test_bursts_come_and_go_smoothly():
     t = np.arange(0.0, 3600.0, 0.2)
-    options = replace(resolved(PAPER), real=RealEffects(bursts=10.0, burst_size=10.0))
+    options = replace(resolve(PAPER), real=RealEffects(bursts=10.0, burst_size=10.0))
     error = real_sensors.burst_errors(t, options)
     size = np.hypot(error[:, 0], error[:, 1])
     assert size.max() > 5
@@ -85,7 +85,7 @@ def test_bursts_come_and_go_smoothly():
 
 
 def test_the_antenna_moves_with_the_roll_of_the_body():
-    options = resolved(SimOptions(scenario='town', duration=200.0, antenna_lever_arm=(0, 0, 2.0),
+    options = resolve(SimOptions(scenario='town', duration=200.0, antenna_lever_arm=(0, 0, 2.0),
                                   real=RealEffects(body_roll=0.01)))
     motion, t = motion_of(options), np.arange(20.0, 190.0, 0.5)
     leaning = real_sensors.positions(motion, t, options)
@@ -176,7 +176,7 @@ def test_velocity_errors_have_their_size_and_correlation_time():
 
 @pytest.mark.parametrize(('noise', 'sigma'), [('white', 1.5), ('rtk', 0.02), ('white', 0.7)])
 def test_fix_errors_agree_with_the_covariance(noise, sigma):
-    options = resolved(replace(ROAD, fix_noise=noise, fix_sigma=sigma))
+    options = resolve(replace(ROAD, fix_noise=noise, fix_sigma=sigma))
     errors = sensors.fix_errors(np.arange(20_000) * 0.2, options)
     stated = simulate(options).fix
     for axis in range(3):
@@ -200,7 +200,7 @@ def test_fix_errors_are_applied_east_north_and_up():
 
 
 def test_correlated_fix_errors_have_their_variance_and_correlation_time():
-    options = resolved(replace(ROAD, fix_noise='correlated', fix_correlation_time=10.0))
+    options = resolve(replace(ROAD, fix_noise='correlated', fix_correlation_time=10.0))
     t = np.arange(100_000) * 0.2
     errors = sensors.fix_errors(t, options)[:, :2]
     spread = 5 * np.sqrt(2 * 10.0 / t[-1] / 2)
@@ -222,7 +222,7 @@ def test_fixes_are_positions_of_the_antenna():
 
 
 def test_outliers_have_the_configured_share_and_size():
-    options = resolved(replace(ROAD, outliers=0.1, fix_sigma=0.0))
+    options = resolve(replace(ROAD, outliers=0.1, fix_sigma=0.0))
     far = np.hypot(*sensors.fix_errors(np.arange(20_000) * 0.2, options)[:, :2].T)
     # 5 sigma of a binomial share
     assert (far > 0).mean() == pytest.approx(0.1, abs=5 * np.sqrt(0.1 * 0.9 / 20_000))

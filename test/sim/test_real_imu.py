@@ -12,7 +12,7 @@ import pytest
 from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
 from odocal_ros.sim import real_sensors
 from odocal_ros.sim.noise import make_rng
-from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.options import resolve, SimOptions
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.real_sensors import sensor_axes
 from odocal_ros.sim.scenarios import simulate
@@ -23,7 +23,7 @@ MANY = 40_000
 
 
 def options(**figures):
-    return resolved(replace(STRAIGHT, real=RealEffects(**figures)))
+    return resolve(replace(STRAIGHT, real=RealEffects(**figures)))
 
 
 def test_imu_readings_obey_the_error_model():

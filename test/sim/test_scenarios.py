@@ -16,7 +16,7 @@ from odocal_ros.data.samples import LOCAL_STATUS
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.read_bag import read_bag
 from odocal_ros.sim.noise import reference_drift
-from odocal_ros.sim.options import BY_SCENARIO, REFERENCES, resolved
+from odocal_ros.sim.options import BY_SCENARIO, REFERENCES, resolve
 from odocal_ros.sim.scenarios import motion_of, SCENARIOS, SimOptions, simulate
 
 pytestmark = pytest.mark.core
@@ -24,7 +24,7 @@ LOCAL_KINDS = [kind for kind in REFERENCES if kind != 'fix']
 
 
 def states(name, step=0.1, **options):
-    options = resolved(SimOptions(scenario=name, **options))
+    options = resolve(SimOptions(scenario=name, **options))
     motion = motion_of(options)
     return motion, motion.at(np.arange(0, motion.duration + step / 2, step))
 
@@ -90,14 +90,14 @@ def test_marks_are_imu_stamps_at_rest(name):
 
 def test_every_option_has_a_value():
     for name in SCENARIOS:
-        options = resolved(SimOptions(scenario=name))
+        options = resolve(SimOptions(scenario=name))
         for field in ('duration', 'imu_grade', 'yaw', 'pitch', 'scale', 'nominal_scale',
                       'fix_sigma'):
             assert getattr(options, field) is not BY_SCENARIO
-    assert resolved(options) == options
-    assert resolved(SimOptions(scenario='paper', scale=0.5)).nominal_scale == 0.6
-    assert resolved(SimOptions(odometer='angle', nominal_scale=0.33)).nominal_scale == 0.33
-    assert resolved(SimOptions(fix_noise='rtk')).fix_sigma == 0.02
+    assert resolve(options) == options
+    assert resolve(SimOptions(scenario='paper', scale=0.5)).nominal_scale == 0.6
+    assert resolve(SimOptions(odometer='angle', nominal_scale=0.33)).nominal_scale == 0.33
+    assert resolve(SimOptions(fix_noise='rtk')).fix_sigma == 0.02
 
 
 @pytest.mark.parametrize(('change', 'message'), [
@@ -195,7 +195,7 @@ def indoor(**options):
 @pytest.mark.parametrize('seed', range(10))
 @pytest.mark.parametrize('duration', [30.0, 180.0])
 def test_a_robot_drives_straight_sections_arcs_and_turns_on_the_spot(seed, duration):
-    motion = motion_of(resolved(SimOptions(scenario='indoor', seed=seed, duration=duration)))
+    motion = motion_of(resolve(SimOptions(scenario='indoor', seed=seed, duration=duration)))
     assert motion.duration == pytest.approx(duration)
     state = motion.at(np.arange(0.0, duration, 0.05))
     assert state.speed.min() >= 0.0
@@ -241,7 +241,7 @@ def test_position_errors_have_the_size_of_the_kind_of_source(kind, sigma):
 
 
 def test_amcl_error_is_constant_at_rest_and_decorrelates_with_the_path():
-    options = resolved(SimOptions(scenario='indoor', reference='amcl'))
+    options = resolve(SimOptions(scenario='indoor', reference='amcl'))
     t = np.arange(0.0, 20_000.0, 1.0)
     travel = np.where(t < 10_000.0, 0.0, t - 10_000.0)
     error = reference_drift(t, travel, options)
@@ -253,8 +253,8 @@ def test_amcl_error_is_constant_at_rest_and_decorrelates_with_the_path():
 
 def test_slam_drifts_with_the_path_and_jumps_back():
     t = np.arange(0.0, 3000.0, 0.1)
-    free = resolved(SimOptions(scenario='indoor', closure_time=0.0))
-    closing = resolved(SimOptions(scenario='indoor'))
+    free = resolve(SimOptions(scenario='indoor', closure_time=0.0))
+    closing = resolve(SimOptions(scenario='indoor'))
     steps = np.diff(reference_drift(t, t, free)[:, :2], axis=0)       # at 1 m/s
     assert steps.std() == pytest.approx(0.01 * np.sqrt(0.1), rel=0.02)
     error = reference_drift(t, t, closing)[:, :2]

@@ -14,7 +14,7 @@ from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, Motion, rigid_imu_output, Start
 from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, random_walk, stamps, white
-from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.options import resolve, SimOptions
 from odocal_ros.sim.profile import chain, hold, ramp
 from odocal_ros.sim.scenarios import motion_of, simulate
 
@@ -86,7 +86,7 @@ def test_gauss_markov_is_stationary_with_its_correlation_time():
 
 @pytest.mark.parametrize('grade', list(GRADES))
 def test_imu_errors_have_the_size_of_the_grade(grade):
-    options = resolved(replace(TOWN, imu_grade=grade))
+    options = resolve(replace(TOWN, imu_grade=grade))
     figures = GRADES[grade]
     gyro, accel = sensors.imu_errors(options, 30_000)
     for errors, noise, walk in ((gyro, figures.gyro_noise, figures.gyro_bias_walk),
@@ -102,7 +102,7 @@ def test_imu_errors_have_the_size_of_the_grade(grade):
 
 def test_biases_have_the_random_walk_of_the_grade(monkeypatch):
     monkeypatch.setitem(sensors.SIM_GRADES, 'perfect', Grade(0, 0, 2e-6, 0, 0, 3e-5))
-    options = resolved(replace(TOWN, imu_grade='perfect'))
+    options = resolve(replace(TOWN, imu_grade='perfect'))
     for errors, walk in zip(sensors.imu_errors(options, 10_000), (2e-6, 3e-5), strict=True):
         steps = np.diff(errors, axis=0)
         assert steps.var() / walk**2 * options.imu_rate == pytest.approx(1, rel=sure(3 * 9_999))
@@ -110,7 +110,7 @@ def test_biases_have_the_random_walk_of_the_grade(monkeypatch):
 
 
 def test_a_perfect_imu_measures_the_motion_in_its_mounted_axes():
-    options = resolved(replace(TOWN, imu_grade='perfect', yaw=0.3, pitch=-0.1, roll=0.05,
+    options = resolve(replace(TOWN, imu_grade='perfect', yaw=0.3, pitch=-0.1, roll=0.05,
                                mounting_rpy=(np.pi, 0.0, 0.0), imu_lever_arm=(1.0, 0.5, 0.2)))
     drive = simulate(options)
     t = (drive.imu.stamp_ns - options.start_ns) * 1e-9
@@ -142,7 +142,7 @@ def test_orientation_and_heading_have_one_error_for_the_drive():
 
 @pytest.mark.parametrize('speed', [5.0, -5.0])
 def test_pulses_are_behind_the_travel_by_less_than_one(speed):
-    drive, options = motion(speed), resolved(TOWN)
+    drive, options = motion(speed), resolve(TOWN)
     (sent,) = sensors.odometers(drive, options)
     t = (sent.stamp_ns - options.start_ns) * 1e-9
     left = drive.at(t).travel / options.scale - (sent.value - sent.value[0])
@@ -156,11 +156,11 @@ def test_pulses_are_behind_the_travel_by_less_than_one(speed):
 
 def test_an_angle_is_not_quantised_and_a_speed_is_the_true_one_over_scale():
     drive = motion()
-    options = resolved(replace(TOWN, odometer='angle'))
+    options = resolve(replace(TOWN, odometer='angle'))
     (sent,) = sensors.odometers(drive, options)
     t = (sent.stamp_ns - options.start_ns) * 1e-9
     assert_allclose((sent.value - sent.value[0]) * options.scale, drive.at(t).travel, atol=1e-12)
-    options = resolved(replace(TOWN, odometer='speed'))
+    options = resolve(replace(TOWN, odometer='speed'))
     (sent,) = sensors.odometers(drive, options)
     assert_allclose(sent.value * options.scale, drive.at(t).speed, atol=1e-14)
     noisy = sensors.odometers(drive, replace(options, speed_noise=0.05))[0].value
@@ -178,7 +178,7 @@ def test_late_stamps_change_no_value():
 
 
 def test_slip_occurs_only_in_motion_with_the_configured_size():
-    options = resolved(replace(TOWN, slip_walk=0.01, odometer_rate=200.0))
+    options = resolve(replace(TOWN, slip_walk=0.01, odometer_rate=200.0))
     drive = motion(seconds=200.0)
     _, t = stamps(drive.duration, 200.0)
     state = drive.at(t)
@@ -186,7 +186,7 @@ def test_slip_occurs_only_in_motion_with_the_configured_size():
     moving = state.speed[1:] > sensors.MOTION_LIMIT
     assert (steps[~moving] == 0).all()
     assert steps[moving].var() * 200 / 0.01**2 == pytest.approx(1, rel=sure(moving.sum()))
-    spins = resolved(replace(TOWN, slip_events=300.0, slip_size=0.2))
+    spins = resolve(replace(TOWN, slip_events=300.0, slip_size=0.2))
     spun = sensors.slip(state, spins)
     # whole events; 300 / h * 208 s = 17.3 expected, 5 sigma of Poisson: 21
     events = spun[-1] / 0.2
@@ -196,7 +196,7 @@ def test_slip_occurs_only_in_motion_with_the_configured_size():
 
 
 def test_a_wheel_slips_after_each_start_and_not_elsewhere():
-    options = resolved(replace(TOWN, start_slip=0.005, start_slip_time=5.0))
+    options = resolve(replace(TOWN, start_slip=0.005, start_slip_time=5.0))
     drive = motion_of(options)
     _, t = stamps(drive.duration, 50.0, PHASE['odometer'])
     state = drive.at(t)
@@ -257,7 +257,7 @@ def test_heading_topic_is_of_the_body_and_orientation_of_the_imu_axes():
 
 
 def test_a_gyro_scale_error_is_on_all_rates():
-    options = resolved(replace(TOWN, imu_grade='perfect'))
+    options = resolve(replace(TOWN, imu_grade='perfect'))
     right, wrong = (simulate(o).imu.w_i for o in (options, replace(options,
                                                                    gyro_scale_error=0.01)))
     assert_allclose(wrong, 1.01 * right, rtol=1e-12)

@@ -13,7 +13,7 @@ from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.read_bag import read_bag
 from odocal_ros.sim import wheels
-from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.options import resolve, SimOptions
 from odocal_ros.sim.real_effects import RealEffects
 from odocal_ros.sim.scenarios import motion_of, simulate
 
@@ -88,7 +88,7 @@ TOWN = SimOptions(scenario='town', duration=200.0, imu_rate=20.0, wheels=4, seed
 
 @pytest.mark.parametrize('count', [1, 2, 3, 4, 6, 7, 8])
 def test_the_mean_count_times_the_scale_is_the_path(count):
-    options = resolved(replace(TOWN, wheels=count))
+    options = resolve(replace(TOWN, wheels=count))
     fixed = [wheel for wheel in wheels.wheels_of(options) if not wheel.steered]
     assert np.mean([1 / wheel.scale for wheel in fixed]) == pytest.approx(1 / options.scale)
     names = [wheel.name for wheel in wheels.wheels_of(options)]
@@ -132,7 +132,7 @@ RUN = {'scenario': 'straight', 'duration': 400.0, 'imu_rate': 20.0}
 
 
 def run(**figures):
-    motion = motion_of(resolved(SimOptions(**RUN)))
+    motion = motion_of(resolve(SimOptions(**RUN)))
     return motion, motion.at(np.arange(0, 400, 0.02)), RealEffects(**figures)
 
 
@@ -183,14 +183,15 @@ def test_the_true_scale_is_metres_over_counts_between_the_marks(odometer):
 def test_speed_quantisation_is_symmetric_in_both_directions():
     v = np.array([0.0, 0.2, 0.3, 0.99, -0.99, 1.6])
     floor, near = (RealEffects(speed_step=0.5, speed_rounding=r) for r in ('floor', 'round'))
-    assert_allclose(wheels.quantized(v, floor), [0, 0, 0, 0.5, -0.5, 1.5])
-    assert_allclose(wheels.quantized(v, near), [0, 0, 0.5, 1.0, -1.0, 1.5])
-    assert_allclose(wheels.quantized(v, RealEffects(dead_band=0.5)), [0, 0, 0, 0.99, -0.99, 1.6])
+    assert_allclose(wheels.published_speed(v, floor), [0, 0, 0, 0.5, -0.5, 1.5])
+    assert_allclose(wheels.published_speed(v, near), [0, 0, 0.5, 1.0, -1.0, 1.5])
+    assert_allclose(wheels.published_speed(v, RealEffects(dead_band=0.5)),
+                    [0, 0, 0, 0.99, -0.99, 1.6])
 
 
 def test_a_filtered_speed_lags_a_ramp_by_its_time_constant():
     t = np.arange(0.0, 20.0, 0.05)
-    sent = wheels.low_passed(1.5 * t, t, 0.4)
+    sent = wheels.low_pass_speed(1.5 * t, t, 0.4)
     # steps of first order: the input of a step counts as its end, half a step early
     assert sent[-1] == pytest.approx(1.5 * (t[-1] - 0.4 + 0.025), abs=1.5 * 0.05**2 / 0.4)
-    assert wheels.low_passed(t, t, 0.0) is t
+    assert wheels.low_pass_speed(t, t, 0.0) is t
