@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The forecast of a leg while it is recorded, and its text."""
+"""
+The forecast of a leg while it is recorded, and its text.
+
+A forecast has the sigmas of the leg if it ended at the current position, and the remaining
+distance to the limits. ``leg_forecast.py`` computes it.
+"""
 
 from dataclasses import dataclass, field, replace
 import math
@@ -14,7 +19,7 @@ from odocal_ros.reasons import Reason
 
 FARTHEST_LIMIT_M = 2e4    # judgement: longest remaining distance of a useful forecast
 # definition
-UNREACHABLE = f'the limit is not reached within another {FARTHEST_LIMIT_M / 1000:.0f} km'
+UNREACHABLE_TEXT = f'the limit is not reached within another {FARTHEST_LIMIT_M / 1000:.0f} km'
 # judgement: standstill at a predicted end; it gives the level and the gyro bias
 PREDICTED_REST_S = 10.0
 SOURCE_SHARE = 0.01    # judgement: share of the variance; smaller sources are not listed
@@ -22,8 +27,8 @@ SOURCE_SHARE = 0.01    # judgement: share of the variance; smaller sources are n
 RUNNING_UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
 
 
-class Abandoned(Exception):
-    """The leg is over: its forecast is not needed."""
+class LegEnded(Exception):
+    """The leg has ended: its forecast is not needed."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class ParameterForecast:
     limit: float            # required sigma
     remaining_m: float | None    # remaining distance to the limit; 0: reached, None: unreachable
     sources: tuple[tuple[str, float], ...] = ()     # (name, sigma) of the largest errors, in order
-    why: str = ''           # reason why more driving does not reach the limit
+    limitation: str = ''    # reason why more driving does not reach the limit
     value_text: str = ''    # the value so far, as text, if it is determined before the end
     manoeuvre: str = ''     # required manoeuvres, besides distance
 
@@ -42,7 +47,8 @@ class ParameterForecast:
         """
         Return the forecast as text.
 
-        unit, factor : of the printed sigmas.   driven_m : m since the forecast.
+        name : of the parameter.   unit, factor : of the printed sigmas, and from ``sigma`` to it.
+        driven_m : path length since the forecast, m.
         """
         if unit == 'ppm':
             factor, unit = relative_unit(self.sigma or 0.0, self.limit)
@@ -56,7 +62,7 @@ class ParameterForecast:
             return f'{estimate} so far (limit {limit})' if self.value_text else (
                 f'{name} is not determined yet' + (f' ({sigma} {unit})' if sigma else ''))
         if self.remaining_m is None:
-            return f'{estimate}: {self.why}'
+            return f'{estimate}: {self.limitation}'
         if self.remaining_m == 0.0:
             return f'OK: {estimate} (limit {limit})'
         remaining_m = self.remaining_m - driven_m
@@ -97,13 +103,13 @@ class Forecast:
                 'left_right': wheels.left_right, 'track_width': wheels.track_width}[quantity]
 
     def as_text(self, distance_m: float = 0.0) -> str:
-        """Return reached and unreachable limits, and the distances from distance_m, as text."""
+        """Return limits and remaining distances as text; distance_m : of the leg by now, m."""
         driven_m = max(0.0, distance_m - self.distance_m)
         return '; '.join([self.scale.as_text('scale', 'ppm', 1e6, driven_m),
                           self.yaw.as_text('yaw', 'deg', math.degrees(1), driven_m)])
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Return True if more driving cannot reach any limit."""
         return not (self.scale.remaining_m or self.yaw.remaining_m or self.manoeuvres)
 
@@ -153,12 +159,12 @@ def _combine_parameter(earlier: ParameterForecast, newest: ParameterForecast) ->
         return newest
     if earlier.remaining_m == 0.0 and not earlier.manoeuvre:
         return earlier
-    return replace(earlier, remaining_m=newest.remaining_m, why=newest.why,
+    return replace(earlier, remaining_m=newest.remaining_m, limitation=newest.limitation,
                    manoeuvre=newest.manoeuvre)
 
 
 def status_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str | float]:
-    """Return the keys of ``~/status``; age_s : of the newest sample of the forecast."""
+    """Return the keys of ``~/status`` on a forecast; age_s : of its newest sample."""
     keys = _running_keys(forecast, age_s)
     for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
         parameter = ParameterForecast(None, 0.0, None) if forecast is None else (

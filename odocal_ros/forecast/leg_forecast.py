@@ -20,12 +20,12 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import take
 from odocal_ros.forecast import leg_so_far, smoother_forecast
 from odocal_ros.forecast.forecast import (
-    Abandoned,
     Forecast,
+    LegEnded,
     main_sources,
     ParameterForecast,
     PREDICTED_REST_S,
-    UNREACHABLE,
+    UNREACHABLE_TEXT,
 )
 from odocal_ros.forecast.planned_drive import insert_section, PlannedDrive, REST_SPEED
 from odocal_ros.forecast.predict import find_remaining_distance, predict, Prediction, Sigmas
@@ -54,7 +54,7 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
     Return the forecast of a leg that ends here, with the faults of its methods so far.
 
     leg : the data so far; its last row is the current position.   fix_rate : Hz.   config :
-    settings at the leg's start.   is_needed : called repeatedly; if False, Abandoned is raised.
+    settings at the leg's start.   is_needed : called repeatedly; if False, LegEnded is raised.
     smoother : of this leg; each update starts from the previous one.
 
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
@@ -74,7 +74,7 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
     if missing_force:
         forecast = smoother_forecast.without_accelerometer_values(forecast)
     if not is_needed():
-        raise Abandoned
+        raise LegEnded
     if running is not None:
         forecast = smoother_forecast.add_running_estimate(forecast, running, config)
     estimates, _ = choose(forecast.methods, config.method)
@@ -88,22 +88,22 @@ def _forecast_by_end_points(leg: Leg, fix_rate: float, config: Config,
     profile = leg_so_far.drive_profile(inputs, config)
     sigmas = Sigmas(config=_with_expected_heading(leg, config),
                     **leg_so_far.fix_and_count_accuracy(inputs, config) | {'fix_rate': fix_rate})
-    drive = _with_final_rest(_thin(profile))
+    drive = _with_final_rest(_thin_rows(profile))
     prediction = predict(drive, sigmas)
 
     def lengthen(drive: PlannedDrive, metres: float) -> PlannedDrive:
         if not is_needed():
-            raise Abandoned
+            raise LegEnded
         return drive_on(drive, metres)
 
-    def forecast(parameter: str, limit: float, why: str = '') -> ParameterForecast:
+    def forecast(parameter: str, limit: float, limitation: str = '') -> ParameterForecast:
         sigma = prediction.sigma(parameter)
         metres = 0.0 if sigma is not None and sigma <= limit else None
-        if metres is None and not why:
+        if metres is None and not limitation:
             metres = find_remaining_distance(drive, sigmas, parameter, limit, lengthen)
-            why = UNREACHABLE
+            limitation = UNREACHABLE_TEXT
         return ParameterForecast(sigma, limit, metres,
-                                 main_sources(prediction.method, parameter), why)
+                                 main_sources(prediction.method, parameter), limitation)
 
     limits = config.verdict
     return Forecast(
@@ -120,7 +120,7 @@ def _without_refusal(two_point: ParameterForecast) -> ParameterForecast:
 
 
 def _yaw_limit_reason(prediction: Prediction, limit: float) -> str:
-    """Return the explanation why no drive reaches the yaw limit, empty if one can."""
+    """Return the reason why no drive reaches the yaw limit, empty if one can."""
     alignment = prediction.alignment
     if not alignment.heading_separable:
         return ('not separable from the course over ground, the only heading; set '
@@ -142,21 +142,22 @@ def _with_expected_heading(leg: Leg, config: Config) -> Config:
         'imu_orientation': stated_variance(take(leg.imu, near_start(leg.imu.stamp_ns)))})
 
 
-def _thin(drive: PlannedDrive) -> PlannedDrive:
+def _thin_rows(drive: PlannedDrive) -> PlannedDrive:
     """Return a drive with at most about DRIVE_ROWS rows; its stops and starts are kept."""
     rest = np.abs(drive.speed) <= REST_SPEED
-    change = np.flatnonzero(np.diff(rest))
-    if len(change) > DRIVE_ROWS // 4:
-        change = change[:0]
-    every = np.linspace(0, len(rest) - 1, min(len(rest), DRIVE_ROWS - 2 * len(change))).astype(int)
-    keep = np.unique(np.concatenate([every, change, change + 1]))
+    changes = np.flatnonzero(np.diff(rest))      # last rows before a stop or a start
+    if len(changes) > DRIVE_ROWS // 4:
+        changes = changes[:0]
+    count = min(len(rest), DRIVE_ROWS - 2 * len(changes))
+    keep = np.unique(np.concatenate([
+        np.linspace(0, len(rest) - 1, count).astype(int), changes, changes + 1]))
     return replace(drive, **{name: getattr(drive, name)[keep]
                              for name in ('t', 'speed', 'yaw', 'slope')})
 
 
 def _with_final_rest(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with a standstill of PREDICTED_REST_S seconds at its end."""
-    moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
-    rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
-    return drive if rested >= PREDICTED_REST_S else drive.cut_at(
-        drive.duration, PREDICTED_REST_S - rested)
+    last = int(np.flatnonzero(np.abs(drive.speed) > REST_SPEED)[-1])      # row in motion
+    rest_s = drive.duration - float(drive.t[last]) if last < len(drive.t) - 1 else 0.0
+    return drive if rest_s >= PREDICTED_REST_S else drive.cut_at(
+        drive.duration, PREDICTED_REST_S - rest_s)

@@ -28,7 +28,7 @@ from odocal_ros.estimator import (
     SmootherLeg,
     too_few_samples_reason,
 )
-from odocal_ros.forecast.forecast import Abandoned
+from odocal_ros.forecast.forecast import LegEnded
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.time_series import running_integral
@@ -184,13 +184,13 @@ class SmootherSoFar:
         Return the running estimate.
 
         leg : the data so far, including those of the last call.   config : settings at the leg's
-        start.   is_needed : called between passes; Abandoned is raised if it returns False.
+        start.   is_needed : called between passes; LegEnded is raised if it returns False.
 
         Raises OdocalError: too few data, or no fit; the next update is a cold start.
         """
         def trace(*_: object) -> None:
             if not is_needed():
-                raise Abandoned
+                raise LegEnded
 
         try:
             smoother_leg = self._smoother_leg(leg, config)

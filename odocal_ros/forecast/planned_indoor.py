@@ -148,11 +148,11 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
                      for sign, side in zip((-1, 1), settings.SIDES, strict=True)),
         origin=replace(leg.origin, local_earth_rate=rate_without_north(leg.origin.latitude)))
     # the positions of a rest share one error
-    ideal = replace(ideal, leg=leg, fixes_in_one=1.0 if robot.at_rests else ideal.fixes_in_one)
+    ideal = replace(ideal, leg=leg, fixes_per_row=1.0 if robot.at_rests else ideal.fixes_per_row)
     problem = make_problem(leg, config, ideal.imu)
-    white = 1 / ideal.fixes_in_one
+    white = 1 / ideal.fixes_per_row
     slow = 2 / max(tau, 1.0) * robot.drift_sigma**2 * drifts      # driving noise of the drift
-    levels = planned_methods.planned_noise_levels(problem, sigmas, ideal.fixes_in_one).replaced(
+    levels = planned_methods.planned_noise_levels(problem, sigmas, ideal.fixes_per_row).replaced(
         fix=white, fix_up=white, slow=slow, slow_up=slow)
     fit = planned_methods.fit_at_truth(problem, ideal, levels)
     return _with_slip(make_result(leg, problem, fit, config), motion, robot)

@@ -20,7 +20,6 @@ from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors.factor import VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.factors.heading import CONFIGURED_NOISE, Heading
-from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.imu import ImuSteps, keyframe_samples, sensor_noise
 from odocal_ros.estimator.leg import BEFORE_MARK, EXTERNAL_RATE, ExternalSamples, SmootherLeg
@@ -33,7 +32,7 @@ from odocal_ros.estimator.result.outcome import make_result
 from odocal_ros.estimator.smoother import too_few_samples_reason
 from odocal_ros.estimator.state import M, State
 from odocal_ros.forecast.planned_drive import PlannedDrive
-from odocal_ros.forecast.predict import predict, Prediction, Sigmas
+from odocal_ros.forecast.predict import EXTERNAL_SOURCES, predict, Prediction, Sigmas
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.dead_reckoning import gravity_n, Origin
 from odocal_ros.nav.geodesy import earth_rate_n
@@ -44,8 +43,8 @@ from odocal_ros.reasons import Code, Reason, rejecting, Verdict, verdict_of
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import grade_of
 
-HEADING_TOPICS = ('heading_topic', 'imu_orientation')
 WIDEST_SPACING = 5.0    # s, judgement: between keyframes of a planned drive
+WHITE_SIGMA_SHARE = 0.2    # judgement: white part of time-correlated fix errors, over their sigma
 SWAY_RATE = 10.0        # Hz, definition: of the white noise of sigmas.sway
 
 
@@ -56,7 +55,7 @@ class IdealSamples:
     leg: SmootherLeg        # at most one fix and one heading for each keyframe
     imu: ImuSteps           # with keyframes
     state: State            # true state at the keyframes
-    fixes_in_one: float     # number of planned fixes that each fix of the leg replaces
+    fixes_per_row: float    # number of planned fixes that each fix of the leg stands for
 
 
 class _Motion(NamedTuple):
@@ -77,13 +76,14 @@ def ideal_samples(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> IdealS
 
     Mounting angles are zero, the scale is 1: sigmas do not depend on them.
 
-    sigmas : lever arms, fix rate and sigma, size of a count, external heading.   spacing : s
+    sigmas : with lever arms, fix rate and sigma, size of a count, external heading.   spacing : s
     between keyframes.
     """
     config = sigmas.config
     spans = np.array(drive.standstills(config.leg.standstill)).reshape(-1, 2)
-    at_start = [span for span in spans if span[0] <= 0.5 and span[1] >= -BEFORE_MARK]
-    t_begin = max(min(0.0, float(at_start[-1][0])), -config.leg.preroll) if at_start else 0.0
+    # the samples begin with the standstill at the start mark, within the pre-roll
+    start_rests = [begin for begin, end in spans.tolist() if begin <= 0.5 and end >= -BEFORE_MARK]
+    t_begin = max(min(0.0, start_rests[-1]), -config.leg.preroll) if start_rests else 0.0
     origin = Origin(drive.latitude, drive.longitude, drive.height)
     highest_rate = 20.0    # Hz: the noise of a second does not depend on the sample rate
     samples_per_interval = 50    # enough between keyframes that lie far apart
@@ -136,7 +136,7 @@ def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
     source, sigma = config.alignment.source, config.alignment.heading_sigma
     if source == 'fixed':
         t, noise = np.zeros(1), CONFIGURED_NOISE
-    elif source in HEADING_TOPICS and sigma <= HEADING_LIMIT:
+    elif source in EXTERNAL_SOURCES and sigma <= HEADING_LIMIT:
         t = _sample_times(t_begin, drive.duration, EXTERNAL_RATE, spacing)
         noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * EXTERNAL_RATE))
     else:
@@ -166,7 +166,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
         return refused_result([too_few], '1')
     ideal = ideal_samples(drive, sigmas, keyframe_spacing(drive) if spacing is None else spacing)
     problem = make_problem(ideal.leg, sigmas.config, ideal.imu)
-    levels = planned_noise_levels(problem, sigmas, ideal.fixes_in_one)
+    levels = planned_noise_levels(problem, sigmas, ideal.fixes_per_row)
     try:
         fit = fit_at_truth(problem, ideal, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
@@ -188,26 +188,26 @@ def keyframe_spacing(drive: PlannedDrive) -> float:
     return float(max(usual, drive.duration / max_intervals))
 
 
-def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) -> Levels:
+def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_per_row: float = 1.0) -> Levels:
     """
     Return the noise levels of a planned drive, which a fit would estimate.
 
     IMU: by its grade. Wheel slip: ``sigmas.slip``. Sideways and vertical motion: ``sigmas.sway``.
-    Fixes: the stated sigma, white, or with a correlation time WHITE_SHARE of it white and the rest
-    time-correlated. No level is below the lower bound of the smoother.
+    Fixes: the stated sigma, white, or with a correlation time WHITE_SIGMA_SHARE of it white and
+    the rest time-correlated. No level is below the lower bound of the smoother.
     """
     grade = grade_of(sigmas.config.imu)
     road = dict.fromkeys(SLIP_LEVELS, sigmas.sway**2 / SWAY_RATE)
     road |= dict.fromkeys(('along', 'along_hard'), sigmas.slip**2)
     tau = sigmas.correlation_time
-    white, up = WHITE_SHARE**2 if tau else 1.0, sigmas.covariance_n[2, 2]
+    white, up = WHITE_SIGMA_SHARE**2 if tau else 1.0, sigmas.covariance_n[2, 2]
     values = road | {name: sigma**2 for name, sigma in sensor_noise(grade).items()} | {
         name: 2 / max(tau, 1.0) * (1 - white) * variance
         for name, variance in (('slow', sigmas.fix**2), ('slow_up', up))}
-    values |= dict.fromkeys(('fix', 'fix_up'), white / fixes_in_one)
+    values |= dict.fromkeys(('fix', 'fix_up'), white / fixes_per_row)
     minimum = {name: problem.min_levels.get(name, 0.0) for name in values}
-    # the bound is for one fix, not for the fixes that it replaces
-    minimum |= {name: minimum[name] / fixes_in_one for name in ('fix', 'fix_up')}
+    # the bound is for one fix, not for those that a row stands for
+    minimum |= {name: minimum[name] / fixes_per_row for name in ('fix', 'fix_up')}
     return problem.initial_levels.replaced(correlation_time=tau, **{
         name: max(value, minimum[name]) for name, value in values.items()})
 
@@ -227,21 +227,21 @@ class Plan:
 
     two_point: Prediction               # with alignment, path length and reasons of the drive
     methods: dict[str, MethodResult]    # predicted result by name of the method
-    estimates: dict[str, Estimate]      # each from the method that will provide it, as in a result
-    deciding: tuple[str, ...]           # the methods that may give a parameter
+    estimates: dict[str, Estimate]      # each from the method that will give it, as in a result
+    deciding: tuple[str, ...]           # names of the methods that may give a parameter
 
     def sigma(self, parameter: str) -> float | None:
         """Return the sigma that will be stated, relative or rad; None: not determined."""
         return self.estimates[parameter].sigma
 
     def method_of(self, parameter: str) -> str:
-        """Return the method that will give a parameter, empty: none."""
+        """Return the name of the method that will give a parameter, empty: none."""
         estimate = self.estimates[parameter]
         return estimate.method if estimate.value is not None else ''
 
     @property
     def methods_used(self) -> tuple[str, ...]:
-        """Return the methods that will give any parameter of interest."""
+        """Return the names of the methods that will give scale, yaw or pitch."""
         names = (self.method_of(parameter) for parameter in self.two_point.method.parameters)
         return tuple(dict.fromkeys(name for name in names if name))
 

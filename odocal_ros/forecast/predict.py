@@ -4,12 +4,14 @@
 """
 Prediction of the sigmas of the two-point method for a leg, before or during the drive.
 
-The planned drive is converted to a track, two marks and an alignment, as a recorded one, and
-processed by ``two_point.fit``: predictions and results have the same error budget.
+In: a planned drive and the errors of its sensors. The drive is converted to the inputs of
+``two_point.fit``, a track, two marks and an alignment, so that predictions and results have the
+same error budget.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,7 +46,6 @@ from odocal_ros.settings.levels import SWAY
 from odocal_ros.settings.nominal import Grade, grade_with_turn_on_bias
 
 SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive determines it
-Lengthen = Callable[[PlannedDrive, float], PlannedDrive]
 EXTERNAL_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
 
 
@@ -53,14 +54,14 @@ class Sigmas:
     """
     Errors of a planned drive, 1 sigma.
 
-    config : grade of the IMU (imu.*), heading source and its sigma (alignment.*; ``auto`` uses
-    the configured heading if it is set, else a gyrocompass if the gyro is good enough, else the
-    course), lever arm, latencies, correlation time of the fixes (NaN: 60 s; 0: white).
+    config : imu.grade, heading source and its sigma (alignment.*; ``auto`` uses the configured
+    heading if it is set, else a gyrocompass if the gyro is good enough, else the course), lever
+    arms, latencies, gnss.correlation_time (NaN: 60 s; 0: white).
     """
 
     config: Config = Config()
     fix: float = 1.5                 # m, of one fix, east and north each
-    fix_up: float | None = None      # m, up; None: twice that
+    fix_up: float | None = None      # m, of one fix, up; None: twice ``fix``
     fix_rate: float = 5.0            # Hz
     quantum: float = 0.0             # m, size of an odometer count, 0 for speeds
     # for the smoother only: motion of the odometer's point to the side and up, m/s, white at 10
@@ -69,8 +70,7 @@ class Sigmas:
     slip: float = SLIP
 
     def __post_init__(self) -> None:
-        up = 2 * self.fix if self.fix_up is None else self.fix_up
-        for label, value in (('fix sigma', self.fix), ('height sigma of the fixes', up),
+        for label, value in (('fix sigma', self.fix), ('height sigma of the fixes', self._up),
                              ('fix rate', self.fix_rate),
                              ('heading sigma', self.config.alignment.heading_sigma)):
             if not (np.isfinite(value) and value > 0):
@@ -81,16 +81,19 @@ class Sigmas:
                 raise BadConfig(f'{label} {value:g}: required: 0 or more')
 
     @property
+    def _up(self) -> float:
+        """Return the sigma of one fix up, m."""
+        return 2 * self.fix if self.fix_up is None else self.fix_up
+
+    @property
     def covariance_n(self) -> Floats:
         """Return the covariance of one fix, (3, 3) m^2."""
-        up = 2 * self.fix if self.fix_up is None else self.fix_up
-        return np.diag([self.fix**2, self.fix**2, up**2])
+        return np.diag([self.fix**2, self.fix**2, self._up**2])
 
     @property
     def correlation_time(self) -> float:
         """Return the correlation time of fix errors, s; 0: white."""
-        configured = self.config.gnss.correlation_time
-        single_receiver = 60.0    # s, of fixes without corrections
+        configured, single_receiver = self.config.gnss.correlation_time, 60.0    # s
         return single_receiver if np.isnan(configured) else configured
 
 
@@ -99,12 +102,12 @@ class Prediction:
     """The prediction of a drive by the two-point method."""
 
     method: MethodResult                  # as in a result; scale factor 1, angles 0
-    reasons: tuple[Reason, ...]           # of drive and method
+    reasons: tuple[Reason, ...]           # of drive, alignment and method
     alignment: Alignment
     distance: float                       # m, path length between the marks
     chord: float                          # m, distance between the marks
     duration: float                       # s
-    standing: tuple[float, float]         # s of rest at each mark, 0 in motion
+    rests: tuple[float, float]            # s of standstill at start and stop mark, 0: in motion
     drive_reasons: tuple[Reason, ...]     # the reasons that concern all methods
 
     def sigma(self, parameter: str) -> float | None:
@@ -130,9 +133,8 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     two_point = TwoPointInput(
         track, start, end, np.zeros(3), _velocity_change(track, (start, end)), alignment)
     reasons = (*alignment_reasons, *drive_reasons)
-    refused = refusal_reasons(two_point, 1.0)
-    if refused:
-        method = refused_result(refused, '1')
+    if refusals := refusal_reasons(two_point, 1.0):
+        method = refused_result(refusals, '1')
     else:
         method = fit(two_point, 1.0, '1', sigmas.quantum, np.ones(3), config)
         reasons += check_limits(method.estimates, 1.0, config)
@@ -144,12 +146,13 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
 
 
 def find_remaining_distance(drive: PlannedDrive, sigmas: Sigmas, parameter: str, limit: float,
-                            lengthen: Lengthen = PlannedDrive.lengthen) -> float | None:
+                            lengthen: Callable[[PlannedDrive, float], PlannedDrive]
+                            = PlannedDrive.lengthen) -> float | None:
     """
     Return the additional straight distance, m, that brings a sigma down to its limit.
 
     None if no distance up to FARTHEST_LIMIT_M is enough: a two-point yaw is never better than its
-    heading.   lengthen : function of the drive and m.
+    heading.   lengthen : returns a drive with additional metres.
     """
     def is_enough(metres: float) -> bool:
         longer = lengthen(drive, metres) if metres else drive
@@ -205,6 +208,14 @@ def _velocity_change(track: Track, marks: tuple[MarkFix, MarkFix]) -> Floats:
     return change
 
 
+class _Heading(NamedTuple):
+    """Source of a heading, its sigma, rad, and the reasons for the choice."""
+
+    source: str
+    sigma: float
+    reasons: tuple[Reason, ...] = ()
+
+
 def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
                    spans: list[tuple[float, float]]) -> tuple[Alignment, tuple[Reason, ...]]:
     """
@@ -223,12 +234,12 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
         level_reasons = (Reason(
             Code.NO_STANDSTILL, 'no standstill before the start mark: level and gyro bias are '
             'estimated from the drive'),)
-    yaw, sigma, source, heading_reasons = _heading(drive, config.alignment, fix_sigma, level,
-                                                   grade)
-    alignment = make_alignment(level, yaw, sigma, source, source != 'gyrocompass',
-                               Origin(drive.latitude, drive.longitude, drive.height), grade,
-                               grade.gyro_noise)
-    return alignment, level_reasons + heading_reasons
+    heading = _plan_heading(config.alignment, fix_sigma, level, grade, drive.latitude)
+    alignment = make_alignment(
+        level, float(np.interp(level.t, drive.t, drive.yaw)), heading.sigma, heading.source,
+        heading.source != 'gyrocompass', Origin(drive.latitude, drive.longitude, drive.height),
+        grade, grade.gyro_noise)
+    return alignment, level_reasons + heading.reasons
 
 
 def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> LevelAttitude:
@@ -242,7 +253,7 @@ def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade)
 
 
 def _level_in_motion(drive: PlannedDrive, grade: Grade) -> LevelAttitude:
-    """Return the level from the first half minute of driving."""
+    """Return the level from the beginning of the drive, MOTION_LEVEL s long."""
     rows = (drive.t >= 0.0) & (drive.t <= MOTION_LEVEL)
     if rows.sum() < 2:
         rows = np.arange(len(drive.t)) < 2
@@ -255,23 +266,23 @@ def _level_in_motion(drive: PlannedDrive, grade: Grade) -> LevelAttitude:
                            drive.speed[rows][[0, -1]], drive.latitude, grade)
 
 
-def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, level: LevelAttitude,
-             grade: Grade) -> tuple[float, float, str, tuple[Reason, ...]]:
-    """Return yaw, rad, its sigma and the source of the heading, and reasons."""
-    yaw = float(np.interp(level.t, drive.t, drive.yaw))
+def _plan_heading(config: AlignmentConfig, fix_sigma: float, level: LevelAttitude, grade: Grade,
+                  latitude: float) -> _Heading:
+    """Return the heading that the alignment will use."""
     source = config.source
     if source in EXTERNAL_SOURCES:
-        return yaw, config.heading_sigma, source, ()
+        return _Heading(source, config.heading_sigma)
     reasons: tuple[Reason, ...] = ()
     if source in ('auto', 'gyrocompass'):
         problem = 'needs a standstill'
         if level.standstill is not None:
-            _, sigma = gyrocompass(level, drive.latitude, grade)
+            _, sigma = gyrocompass(level, latitude, grade)
             if sigma <= COMPASS_LIMIT:
-                return yaw, sigma, 'gyrocompass', ()
+                return _Heading('gyrocompass', sigma)
             problem = ('the gyro bias causes a heading uncertainty of '
-                       f'{np.rad2deg(min(sigma, np.pi)):.1f} deg')
+                       f'{np.rad2deg(min(sigma, np.pi)):.1f} deg; the limit is '
+                       f'{np.rad2deg(COMPASS_LIMIT):.1f} deg')
         if source == 'gyrocompass':
             reasons = (Reason(Code.GYROCOMPASS_REFUSED, f'heading from gyrocompass: {problem}'),)
     path_length = max(COURSE_DISTANCE, 8 * fix_sigma)
-    return yaw, float(np.sqrt(2) * fix_sigma / path_length), 'course', reasons
+    return _Heading('course', float(np.sqrt(2) * fix_sigma / path_length), reasons)

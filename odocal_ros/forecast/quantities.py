@@ -35,32 +35,32 @@ PLANAR_QUANTITIES = {
     OMNI: ('the scale', 'the rotation lever (needs turns)',
            'the factor of each wheel (needs sideways motion)')}
 METHOD_WITHOUT_HEADING = 'smoother'   # the method that needs no external heading
-YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
+YES, NO, UNKNOWN = 'yes', 'no', 'unknown'    # whether a sigma is within its limit
 
 
 @dataclass(frozen=True)
 class Received:
     """What the samples before the start mark contain."""
 
-    variances: dict[str, float]     # stated for the yaw, by source, rad^2; inf if none is sent
-    rested_s: float = 0.0           # duration of the current or last standstill
-    latitude: float = 0.7           # rad
-    height: bool = True             # the fixes have a height
-    two_wheels: bool = False
+    variances: dict[str, float]     # heading source -> stated yaw variance, rad^2; inf: none
+    rest_s: float = 0.0             # duration of the current or last standstill, s
+    latitude: float = 0.7           # rad, default: 40 deg
+    has_height: bool = True         # the fixes have a height
+    two_wheels: bool = False        # the odometer has two wheels
     has_accelerometer: bool = True
-    imu: bool = True                # an IMU is present
+    has_imu: bool = True
 
 
 @dataclass(frozen=True)
 class Observability:
-    """Quantities of a leg, as texts."""
+    """Quantities of a leg as texts for the operator."""
 
     observable: tuple[str, ...]
     not_observable: tuple[str, ...]     # with the cause
     limitation: str = ''                # of the accuracy of all quantities
 
     def as_text(self) -> str:
-        """Return the answer to the operator."""
+        """Return all as one text."""
         *first, last = self.observable
         values = f'{", ".join(first)} and {last}' if first else last
         text = f'observable: {values}'
@@ -72,19 +72,19 @@ class Observability:
 def find_observable(config: Config, received: Received) -> Observability:
     """Return the quantities that a leg determines with these settings, and those it does not."""
     drive = config.odometer.drive
-    if not received.imu or drive != DIFFERENTIAL:
+    if not received.has_imu or drive != DIFFERENTIAL:
         return Observability(PLANAR_QUANTITIES[drive], (
-            'yaw and pitch of the IMU' if received.imu else 'yaw and pitch (no IMU)',))
+            'yaw and pitch of the IMU' if received.has_imu else 'yaw and pitch (no IMU)',))
     methods = [name for name in METHODS if name in deciding_methods(config.method)
                and (received.has_accelerometer or name != METHOD_WITHOUT_HEADING)]
     values = [(True, 'the scale'), _yaw_quantity(config, received, methods),
-              (True, 'the pitch') if received.height else
+              (True, 'the pitch') if received.has_height else
               (False, 'the pitch (fixes without height)')]
     if not received.has_accelerometer:
         values[-1] = False, 'the pitch (IMU without acceleration)'
     if received.two_wheels:
         values += _wheel_quantities(config)
-    limitation = '' if received.rested_s >= config.leg.standstill else (
+    limitation = '' if received.rest_s >= config.leg.standstill else (
         'level and gyro bias are estimated from the drive, because it starts without a standstill')
     return Observability(tuple(text for is_observable, text in values if is_observable),
                          tuple(text for is_observable, text in values if not is_observable),
@@ -119,8 +119,8 @@ def _wheel_quantities(config: Config) -> list[tuple[bool, str]]:
 
 def _expected_alignment(config: Config, received: Received) -> Alignment:
     """Return the alignment of a planned straight drive that starts from this standstill."""
-    rest = received.rested_s if received.rested_s >= config.leg.standstill else 0.0
-    t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
+    rest_s = received.rest_s if received.rest_s >= config.leg.standstill else 0.0
+    t = np.arange(-min(rest_s, config.leg.preroll), 60.0, 0.5)
     drive = drive_from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
                              latitude=received.latitude)
     return plan_alignment(drive, with_heading(config, received.variances), COURSE_FIX_SIGMA,
@@ -157,11 +157,11 @@ def with_heading(config: Config, variances: dict[str, float]) -> Config:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity and its estimates; ``relative``: its limit is relative to the value."""
+    """A quantity that the operator is told about."""
 
-    label: str
-    estimates: tuple[str, ...]
-    relative: bool
+    label: str                           # for people
+    estimates: tuple[str, ...]           # names of its estimates in a result
+    is_relative: bool                    # its sigma and limit are relative to the value
     needs_two_wheels: bool = False
     is_mounting_angle: bool = False      # not estimated by the planar estimator
 
@@ -170,7 +170,7 @@ class Quantity:
         if self.estimates[0] == 'track_width':
             # it has no setting verdict.*, only the limit of the estimator
             return TRACK_WIDTH.determined_share
-        return config.verdict.max_scale_sigma if self.relative else config.verdict.max_yaw_sigma
+        return config.verdict.max_scale_sigma if self.is_relative else config.verdict.max_yaw_sigma
 
 
 QUANTITIES = {
@@ -189,17 +189,17 @@ def all_unknown() -> dict[str, str]:
 
 
 def check_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
-                   rejected: bool = False) -> dict[str, str]:
+                   is_rejected: bool = False) -> dict[str, str]:
     """
     Return yes, no or unknown for each quantity, as if the leg ended now.
 
     forecast : None before its first update: unknown.   two_wheels : the odometer has two wheels.
-    rejected : the leg would be rejected: no value is within its limit. A configured track width
+    is_rejected : the leg would be rejected: no value is within its limit. A configured track width
     that is not determined is unknown, not no.
     """
     if forecast is None:
-        return all_unknown() | dict.fromkeys(('scale', 'yaw', 'pitch') if rejected else (), NO)
-    sigmas = {name: None if rejected else forecast.sigma(name)
+        return all_unknown() | dict.fromkeys(('scale', 'yaw', 'pitch') if is_rejected else (), NO)
+    sigmas = {name: None if is_rejected else forecast.sigma(name)
               for name, quantity in QUANTITIES.items()
               if not (quantity.needs_two_wheels and (not two_wheels or forecast.wheels is None)
                       or quantity.is_mounting_angle and PLANAR in forecast.methods)}
@@ -216,43 +216,41 @@ def check_calibration(calibration: Calibration, config: Config,
                            calibration.verdict is not Verdict.REJECTED, names_with_reason)
 
 
-def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
-                    names_with_reason: Set[str] = frozenset()) -> dict[str, str]:
+def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool,
+                    is_valid: bool, names_with_reason: Set[str] = frozenset()) -> dict[str, str]:
     """
     Return yes, no or unknown for each quantity: whether its sigma is within the limit.
 
-    valid : False: no value is usable.   names_with_reason : estimates with a reason against their
-    use.
+    is_valid : False: no value is usable.   names_with_reason : estimates with a reason against
+    their use.
     """
-    planar = any(estimate.method == PLANAR for estimate in estimates.values())
+    is_planar = any(estimate.method == PLANAR for estimate in estimates.values())
     sigmas: dict[str, float | None] = {}
     unusable = set()
     for name, quantity in QUANTITIES.items():
-        parts = [estimates.get(part_name) for part_name in quantity.estimates]
-        if quantity.is_mounting_angle and planar:
+        values = [estimates.get(estimate_name) for estimate_name in quantity.estimates]
+        if quantity.is_mounting_angle and is_planar:
             continue
         if quantity.needs_two_wheels and not two_wheels and not any(
-                part is not None and part.value is not None for part in parts):
+                value is not None and value.value is not None for value in values):
             continue
-        sigmas[name] = max(sigma_or_infinity(part, quantity.relative) for part in parts)
-        if not valid or names_with_reason & set(quantity.estimates):
+        sigmas[name] = max(sigma_or_infinity(value, quantity.is_relative) for value in values)
+        if not is_valid or names_with_reason & set(quantity.estimates):
             unusable.add(name)
     return _check_sigmas(sigmas, config) | dict.fromkeys(unusable, NO)
 
 
-def status_keys(ok: dict[str, str]) -> dict[str, str]:
-    """Return the entries of ``~/status``: yes, no or unknown by key, such as ``yaw_ok``."""
+def limit_keys(ok: dict[str, str]) -> dict[str, str]:
+    """Return the keys of ``~/status`` on limits, such as ``yaw_ok``: yes, no or unknown."""
     return {f'{name}_ok': value for name, value in ok.items()}
 
 
 def quantities_text(ok: dict[str, str]) -> str:
-    """Return the quantities as text, empty if all are unknown."""
-    parts = []
-    for value, text in ((YES, 'OK'), (NO, 'not OK')):
-        labels = [QUANTITIES[name].label for name, answer in ok.items() if answer == value]
-        if labels:
-            parts.append(f'{text}: {", ".join(labels)}')
-    return '; '.join(parts)
+    """Return the quantities that are OK, and those that are not, as text; empty: all unknown."""
+    labels = {text: ', '.join(QUANTITIES[name].label for name, value in ok.items()
+                              if value == answer)
+              for answer, text in ((YES, 'OK'), (NO, 'not OK'))}
+    return '; '.join(f'{text}: {names}' for text, names in labels.items() if names)
 
 
 def _check_sigmas(sigmas: dict[str, float | None], config: Config) -> dict[str, str]:

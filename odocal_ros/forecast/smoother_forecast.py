@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Forecast from the running estimate of the smoother, or from the planar estimator."""
+"""
+Forecast from the running estimate of the smoother, or from the planar estimator.
+
+``leg_forecast.py`` uses the functions for the smoother; the node calls ``planar_forecast``.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,12 +20,12 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.estimator import RunningEstimate
 from odocal_ros.forecast.forecast import (
-    Abandoned,
     FARTHEST_LIMIT_M,
     Forecast,
+    LegEnded,
     main_sources,
     ParameterForecast,
-    UNREACHABLE,
+    UNREACHABLE_TEXT,
     WheelsForecast,
 )
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
@@ -67,8 +71,9 @@ def has_all_values(running: RunningEstimate | None) -> bool:
 def without_accelerometer_values(forecast: Forecast) -> Forecast:
     """Return a forecast without the values that need an accelerometer."""
     yaw = forecast.yaw
-    if yaw.sigma is None and not yaw.why:
-        yaw = replace(yaw, why='not determined without an accelerometer or an external heading')
+    if yaw.sigma is None and not yaw.limitation:
+        yaw = replace(yaw, limitation='not determined without an accelerometer or an external '
+                                      'heading')
     return replace(forecast, yaw=yaw, pitch=None)
 
 
@@ -116,7 +121,7 @@ def _forecast_scale(running: RunningEstimate, limit: float) -> ParameterForecast
     if value and scale.unit != '1':
         value += f' {scale.unit}'
     return ParameterForecast(sigma, limit, metres, main_sources(running.method, SCALE),
-                             UNREACHABLE, value)
+                             UNREACHABLE_TEXT, value)
 
 
 def _slow_share(running: RunningEstimate) -> float:
@@ -134,8 +139,8 @@ def _forecast_yaw(running: RunningEstimate, limit: float) -> ParameterForecast:
     sigma = float(running.sigmas[1])
     ratio, manoeuvre = sigma / limit, ''
     if ratio > 1:
-        of_one_stop = 2 * STOP_ACCELERATION * max(running.speed, STOP_SPEED)
-        stops = math.ceil(max(running.agility, of_one_stop / 2) * (ratio**2 - 1) / of_one_stop)
+        stop_agility = 2 * STOP_ACCELERATION * max(running.speed, STOP_SPEED)
+        stops = math.ceil(max(running.agility, stop_agility / 2) * (ratio**2 - 1) / stop_agility)
         times = 'often' if stops > MAX_STOPS else f'{stops} time{"s" * (stops > 1)}'
         manoeuvre = f'for the yaw: stop and start {times}, or make as many turns'
     value = '' if yaw.value is None or yaw.sigma is None else format_value(
@@ -153,19 +158,19 @@ def _remaining_distance(running: RunningEstimate, ratio: float, power: float) ->
 def format_value(value: float, sigma: float) -> str:
     """Return a value to a tenth of its sigma, with at most eight digits."""
     size = max(abs(value), sigma)
-    places = math.floor(math.log10(size)) - math.floor(math.log10(sigma)) + 2
-    return f'{value:.{min(max(places, 1), 8)}g}'
+    digits = math.floor(math.log10(size)) - math.floor(math.log10(sigma)) + 2
+    return f'{value:.{min(max(digits, 1), 8)}g}'
 
 
 def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> Forecast:
     """
     Return the forecast of a leg by the planar estimator.
 
-    Raises Abandoned: ``is_needed`` returns False during the fit; BadData: no fit is possible.
+    Raises LegEnded: ``is_needed`` returns False during the fit; BadData: no fit is possible.
     """
     def check_needed(_: Stage | None = None) -> None:
         if not is_needed():
-            raise Abandoned
+            raise LegEnded
     result = planar_leg(leg, settings_by_frame(leg.fix, config), (), check_needed)
     check_needed()
     method = result.methods[PLANAR]
@@ -177,7 +182,7 @@ def planar_forecast(leg: Leg, config: Config, is_needed: Callable[[], bool]) -> 
     return Forecast(
         _planar_scale(result, config.verdict.max_scale_sigma),
         ParameterForecast(None, config.verdict.max_yaw_sigma, None,
-                          why='not estimated on this robot'),
+                          limitation='not estimated on this robot'),
         wheels=forecast_wheels(method), methods={PLANAR: method}, estimates=estimates,
         until_ns=leg.stop_ns, faults=faults)
 
@@ -191,4 +196,4 @@ def _planar_scale(result: LegResult, limit: float) -> ParameterForecast:
     metres = result.distance * max((sigma / limit)**2 - 1, 0.0) if limit else math.inf
     return ParameterForecast(
         sigma, limit, metres if metres <= FARTHEST_LIMIT_M else None,
-        why=UNREACHABLE, value_text=format_value(scale.value, scale.sigma))
+        limitation=UNREACHABLE_TEXT, value_text=format_value(scale.value, scale.sigma))

@@ -36,18 +36,18 @@ class ThinnedLeg:
 
     def __init__(self, form: data.OdometerForm | None = None) -> None:
         self.form = form or COUNTER
-        # by slot: rows of finished cells; samples of the unfinished cell; width of cells; newest
-        # counts; last count as received, (1,), and as unrolled
-        self._cells: dict[str, Any] = {}
-        self._unfinished: dict[str, Any] = {}
-        self._width_ns: dict[str, int] = {}
-        self._recent: dict[str, RecentCounts] = {}
+        # by slot
+        self._cells: dict[str, Any] = {}               # rows of finished cells
+        self._unfinished: dict[str, Any] = {}          # samples of the unfinished cell
+        self._width_ns: dict[str, int] = {}            # of the cells
+        self._recent: dict[str, RecentCounts] = {}     # newest counts
+        # last count as received, (1,), and without rollovers
         self._last: dict[str, tuple[Values, int | float]] = {}
-        self._fix_steps: list[Ints] = []       # ns between fixes
+        self._fix_steps: list[Ints] = []               # ns between fixes
 
     def feed(self, slot: str, samples: data.Samples) -> None:
         """Take a block of a topic."""
-        samples = _usable(samples)
+        samples = _usable_rows(samples)
         if not len(samples.stamp_ns):
             return
         if slot == 'fix':
@@ -55,7 +55,7 @@ class ThinnedLeg:
             self._fix_steps.append(np.diff(np.append(before, samples.stamp_ns)))
         if isinstance(samples, data.OdometerSamples) and self.form.quantity != 'rate':
             recent = self._recent.setdefault(slot, RecentCounts())
-            samples = recent.feed(self._unrolled(slot, samples))
+            samples = recent.feed(self._unroll(slot, samples))
             if not len(samples.stamp_ns):
                 return
         rows = samples if slot not in self._unfinished else data.join(
@@ -67,13 +67,13 @@ class ThinnedLeg:
         self._unfinished[slot] = data.take(rows, slice(first_open, None))
         if not first_open:
             return
-        averaged = self._averaged(slot)
-        cells = _cell_rows(data.take(rows, slice(None, first_open)), cell[:first_open], averaged)
+        mean_columns = self._mean_columns(slot)
+        cells = _cell_rows(data.take(rows, slice(first_open)), cell[:first_open], mean_columns)
         if slot in self._cells:
             cells = data.join([self._cells[slot], cells])
         while len(cells.stamp_ns) > MAX_CELLS:
             width_ns *= 2
-            cells = _cell_rows(cells, cells.stamp_ns // width_ns, averaged)
+            cells = _cell_rows(cells, cells.stamp_ns // width_ns, mean_columns)
         self._cells[slot], self._width_ns[slot] = cells, width_ns
 
     def leg(self, start_ns: int) -> Leg:
@@ -90,7 +90,7 @@ class ThinnedLeg:
 
     def _counts(self, slot: str) -> data.OdometerSamples:
         """Return the cells of a counter, also of rows whose times are not final."""
-        rows = self._recent[slot].rest()
+        rows = self._recent[slot].remaining_rows()
         if slot in self._unfinished:
             rows = data.join([self._unfinished[slot], rows])
         width_ns = self._width_ns.get(slot, FIRST_CELL_NS)
@@ -105,12 +105,12 @@ class ThinnedLeg:
         rising = steps[steps > 0]
         return 1e9 / float(np.median(rising)) if len(rising) else float('nan')
 
-    def _averaged(self, slot: str) -> tuple[str, ...]:
+    def _mean_columns(self, slot: str) -> tuple[str, ...]:
         """Return the names of the columns of a topic that are averaged in a cell."""
         rates = ('value',) if self.form.quantity == 'rate' else ()
         return {'imu': ('w_i', 'f_i'), **dict.fromkeys(WHEELS, rates)}.get(slot, ())
 
-    def _unrolled(self, slot: str, samples: data.OdometerSamples) -> data.OdometerSamples:
+    def _unroll(self, slot: str, samples: data.OdometerSamples) -> data.OdometerSamples:
         """Return counts or increments as a running count that never rolls over."""
         last, count = self._last.get(slot, (samples.value[:1], 0))
         value = samples.value
@@ -123,7 +123,7 @@ class ThinnedLeg:
         return replace(samples, value=total)
 
 
-def _usable(samples: data.SomeSamples) -> data.SomeSamples:
+def _usable_rows(samples: data.SomeSamples) -> data.SomeSamples:
     """Return the rows with a stamp, and with finite values where a mean is computed."""
     keep = samples.stamp_ns > 0
     if isinstance(samples, data.ImuSamples):
@@ -133,18 +133,19 @@ def _usable(samples: data.SomeSamples) -> data.SomeSamples:
     return samples if keep.all() else data.take(samples, keep)
 
 
-def _cell_rows(rows: data.SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> data.SomeSamples:
-    """Return one row for each run of equal ``cell``: the last one, with means of ``averaged``."""
+def _cell_rows(rows: data.SomeSamples, cell: Ints,
+               mean_columns: tuple[str, ...]) -> data.SomeSamples:
+    """Return one row for each run of equal ``cell``: the last one, with means of some columns."""
     first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
     count = np.diff(np.append(first, len(cell)))
     last = data.take(rows, first + count - 1)
-    if not averaged:
+    if not mean_columns:
         return last
 
     def mean(values: Floats | Ints) -> Floats:
-        return (np.add.reduceat(values, first).T / count).T
+        return (np.add.reduceat(values, first).T / count).T      # sums of the runs
 
-    columns: dict[str, Any] = {name: mean(getattr(rows, name)) for name in averaged}
+    columns: dict[str, Any] = {name: mean(getattr(rows, name)) for name in mean_columns}
     since_ns = rows.stamp_ns - np.repeat(rows.stamp_ns[first], count)
     return replace(last, stamp_ns=rows.stamp_ns[first] + mean(since_ns).astype(np.int64),
                    **columns)
@@ -155,7 +156,7 @@ class RecentCounts:
 
     def __init__(self) -> None:
         self._rows: data.OdometerSamples | None = None
-        self._returned = 0             # number of these already returned
+        self._returned = 0             # number of these rows that ``feed`` has returned
 
     def feed(self, rows: data.OdometerSamples) -> data.OdometerSamples:
         """Take rows, and return those whose times are final."""
@@ -167,7 +168,7 @@ class RecentCounts:
         self._rows, self._returned = data.take(rows, slice(first, None)), final_count - first
         return final
 
-    def rest(self) -> data.OdometerSamples:
+    def remaining_rows(self) -> data.OdometerSamples:
         """Return the rows not returned yet at their estimated times; after ``feed`` only."""
         assert self._rows is not None
         return data.take(_at_sampling_times(self._rows), slice(self._returned, None))

@@ -63,7 +63,7 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
     """Yield (text, drive) of drives that are longer or have more manoeuvres."""
     yield f'{length_text(drive.distance)} more, straight ahead', drive.lengthen(drive.distance)
     min_rest = 60.0    # s
-    rest = max(min_rest, *before.two_point.standing)
+    rest = max(min_rest, *before.two_point.rests)
     yield f'standing {duration_text(rest)} longer at both marks', drive.lengthen_rests(rest)
     yield 'one more stop and start', planned_drive.add_stop_and_start(drive)
     yield 'one more left turn and right turn', planned_drive.add_left_and_right_turns(drive)
@@ -166,7 +166,7 @@ class Planned(Plan):
         sigmas, two_point, alignment = self.sigmas, self.two_point, self.two_point.alignment
         return {
             'drive': {'distance': two_point.distance, 'chord': two_point.chord,
-                      'duration': two_point.duration, 'standing': list(two_point.standing)},
+                      'duration': two_point.duration, 'standing': list(two_point.rests)},
             'sigmas': {'imu_grade': sigmas.config.imu.grade,
                        'heading_source': alignment.heading_source,
                        'heading_sigma': alignment.heading_sigma, 'fix_sigma': sigmas.fix,

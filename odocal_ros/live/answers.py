@@ -198,7 +198,7 @@ def _recording_hint(view: SessionView) -> tuple[list[str], list[str]]:
     facts.append(view.forecast.as_text(view.distance_m))
     if view.forecast_age_s > FORECAST_OLD_S:
         facts.append(f'estimate is {view.forecast_age_s:.0f} s old')
-    is_last_step = view.forecast.complete or view.session.is_automatic
+    is_last_step = view.forecast.is_complete or view.session.is_automatic
     return required + ([_end_text(view)] if is_last_step else []), facts
 
 

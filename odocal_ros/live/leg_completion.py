@@ -147,7 +147,7 @@ class LegCompletion:
         return SessionView(
             session, config, missing=inputs.missing_reasons(config),
             duplicate_publishers=inputs.duplicate_publishers(),
-            lost_messages=inputs.lost(), clocks=progress.clocks.differing(config),
+            lost_messages=inputs.lost(), clocks=progress.clocks.find_differing(config),
             rates_hz=recording.rates_hz(), results=self._publishing.results(),
             restored=session.restored_since(), distance_m=self._distance_m,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0,
@@ -183,7 +183,7 @@ class LegCompletion:
     def _start_refusal(self) -> str:
         """Return the reason why no leg can start, as text; empty if one can."""
         missing = self._recording.inputs.missing_reasons(self._config())
-        clocks = self._recording.progress.clocks.differing(self._config())
+        clocks = self._recording.progress.clocks.find_differing(self._config())
         return '; '.join(missing) or (clock_difference_text(clocks) if clocks else '')
 
     def _begin_leg(self, mark_ns: int, is_automatic: bool = False) -> str:

@@ -245,7 +245,7 @@ class Recording:
     def received_before(self, preroll_s: float) -> Received:
         """Return the samples so far that determine what a leg can estimate."""
         return replace(self.progress.received_before(preroll_s), two_wheels=self.two_wheels(),
-                       imu=not self.inputs.without_imu)
+                       has_imu=not self.inputs.without_imu)
 
     def rates_hz(self) -> dict[str, float]:
         now_ns = time.monotonic_ns()

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 from odocal_ros.data.leg import LegRecorder, SLOTS
 from odocal_ros.data.samples import join, OdometerForm, take
 from odocal_ros.forecast import leg_so_far
-from odocal_ros.forecast.forecast import Abandoned, combine_sections, Forecast
+from odocal_ros.forecast.forecast import combine_sections, Forecast, LegEnded
 from odocal_ros.forecast.leg_forecast import forecast_leg
 from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
@@ -177,7 +177,7 @@ def _add_rows(thinned: ThinnedLeg, pre_roll: LegRecorder | None, new_blocks: lis
     """Add the pre-roll, if any, and the new blocks to the thinned leg."""
     for slot in (slot for slot in SLOTS if slot != 'imu_other'):
         if stop_event.is_set():
-            raise Abandoned
+            raise LegEnded
         blocks = [pre_roll.rows(slot)] if pre_roll is not None else []
         blocks += [block for name, block in new_blocks if name == slot]
         blocks = [block for block in blocks if len(block.stamp_ns)]

@@ -6,8 +6,7 @@
 import math
 
 from odocal_ros.calib.number_text import significant
-from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
-from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
+from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE, WHITE_SIGMA_SHARE
 from odocal_ros.library.plan import Planned, ranked, SCALE, YAW
 from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
 from odocal_ros.output import value_text as texts
@@ -56,7 +55,7 @@ def _drive_lines(plan: Planned) -> list[str]:
     sigmas, two_point = plan.sigmas, plan.two_point
     alignment, tau = two_point.alignment, sigmas.correlation_time
     rests = [f'standing {texts.duration_text(rest)}' if rest else 'in motion'
-             for rest in two_point.standing]
+             for rest in two_point.rests]
     noise = f'correlation time {tau:g} s' if tau else 'white'
     lines = [f'{texts.length_text(two_point.distance)} in '
              f'{texts.duration_text(two_point.duration)}, {rests[0]} at the start mark, '
@@ -69,7 +68,7 @@ def _drive_lines(plan: Planned) -> list[str]:
         slip = 1000 * sigmas.slip
         is_estimated = alignment.heading_source in ('course', 'gyrocompass')
         no_heading_text = ' needs no heading;' * is_estimated
-        white = f'; white part of the fix errors {100 * WHITE_SHARE:.0f} %' if tau else ''
+        white = f'; white part of the fix errors {100 * WHITE_SIGMA_SHARE:.0f} %' if tau else ''
         lines.append(f'smoother:{no_heading_text} wheel slip {slip:.2g} mm/√s, sway '
                      f'{sigmas.sway:.2g} m/s (white at {SWAY_RATE:g} Hz){white}')
     return lines

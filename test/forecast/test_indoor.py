@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.forecast.forecast import Abandoned
+from odocal_ros.forecast.forecast import LegEnded
 from odocal_ros.forecast.planned_indoor import predict_robot, Robot
 from odocal_ros.forecast.robot_motion import pattern_motion, PATTERNS
 from odocal_ros.forecast.smoother_forecast import planar_forecast
@@ -109,7 +109,7 @@ def test_the_last_update_agrees_with_the_result(leg):
         assert abs(now.value - then.value) < then.sigma
         assert now.sigma == pytest.approx(then.sigma, rel=0.15)
     assert found.scale.remaining_m == 0.0
-    assert found.complete
+    assert found.is_complete
     assert not found.faults
     assert 'yaw: not estimated on this robot' in found.as_text()
 
@@ -126,5 +126,5 @@ def test_remaining_distance_follows_from_sigma_over_root_of_path(leg):
 def test_no_forecast_is_made_before_the_first_motion_or_if_not_needed(leg):
     with pytest.raises(BadData, match='positions while the wheels have data'):
         forecast(leg, 0.0)
-    with pytest.raises(Abandoned):
+    with pytest.raises(LegEnded):
         forecast(leg, 1e9, lambda: False)

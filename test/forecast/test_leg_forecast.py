@@ -14,8 +14,8 @@ import pytest
 from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import leg_forecast
-from odocal_ros.forecast.forecast import Forecast, ParameterForecast, status_keys, UNREACHABLE
-from odocal_ros.forecast.leg_forecast import Abandoned, drive_on, forecast_leg
+from odocal_ros.forecast.forecast import Forecast, ParameterForecast, status_keys, UNREACHABLE_TEXT
+from odocal_ros.forecast.leg_forecast import drive_on, forecast_leg, LegEnded
 from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.live.answers import hint
@@ -68,7 +68,7 @@ def test_yaw_is_not_reached_below_the_heading_sigma_or_from_course_alone(drive, 
     course = with_settings(config, {'alignment.heading_source': 'course'})
     yaw = forecast_at(drive, course, 150.0).yaw
     assert (yaw.sigma, yaw.remaining_m) == (None, None)
-    assert 'not separable from the course over ground' in yaw.why
+    assert 'not separable from the course over ground' in yaw.limitation
 
 
 def test_yaw_is_not_excluded_by_end_points_before_a_smoother_result(drive):
@@ -80,7 +80,7 @@ def test_yaw_is_not_excluded_by_end_points_before_a_smoother_result(drive):
     assert found.methods == {}
     assert 'yaw is not determined yet' in found.as_text()
     assert found.manoeuvres == ['drive on with stops, starts and turns']
-    assert not found.complete
+    assert not found.is_complete
     still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # never
     never = forecast_leg(still, cells.fix_rate(), config, smoother=SmootherSoFar())
     assert 'yaw: not separable from the course over ground' in never.as_text()
@@ -147,7 +147,7 @@ def test_an_update_stops_at_its_next_step_after_the_end_of_the_leg(drive, config
         required.append(True)
         return len(required) < 3
 
-    with pytest.raises(Abandoned):
+    with pytest.raises(LegEnded):
         forecast_at(drive, strict, 150.0, is_needed=is_needed)
     assert len(required) == 3
 
@@ -196,7 +196,7 @@ def test_without_an_accelerometer_the_forecast_has_a_scale_and_no_angle(two, met
     assert 0.0 < forecast.scale.sigma < 0.01
     assert forecast.wheels.left_right < 0.01
     assert (forecast.yaw.sigma, forecast.pitch) == (None, None)
-    assert forecast.yaw.why
+    assert forecast.yaw.limitation
     assert not any(forecast.estimates[name].value for name in (
         'yaw_mounting_angle', 'pitch_mounting_angle'))
 
@@ -236,7 +236,7 @@ def hint_text(forecast, **more):
      '0.5); call ~/stop_leg'),
     (Forecast(GOOD, NO_YAW), 0.0, 'OK: scale 430 ppm (limit 1000); yaw: limited by the heading '
      'uncertainty (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
-    (Forecast(replace(MORE, remaining_m=None, why=UNREACHABLE), YAW), 10.0,
+    (Forecast(replace(MORE, remaining_m=None, limitation=UNREACHABLE_TEXT), YAW), 10.0,
      'scale 1820 ppm: the limit is not reached within another 20 km; OK: yaw 0.286 deg (limit '
      '0.5); call ~/stop_leg'),
     (Forecast(replace(MORE, sigma=None), NO_YAW, distance_m=300.0), 0.0,

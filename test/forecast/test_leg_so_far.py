@@ -107,7 +107,7 @@ def test_impossible_values_change_no_distance_and_no_standstill(odd, quantity):
         travel = OdometerProgress(OdometerForm(quantity, 0, '1'))
         for k in range(0, len(t), 3):
             travel.feed(take(OdometerSamples(t + SECOND, t + SECOND, sent), slice(k, k + 3)), 1.0)
-        found.append((travel.total, travel.still_s(), travel.top))
+        found.append((travel.path_length, travel.still_s(), travel.top_speed))
     assert found[1] == pytest.approx(found[0], abs=0.2)
     assert found[0][0] == pytest.approx(30.0, abs=0.3)
 

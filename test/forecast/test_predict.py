@@ -131,7 +131,7 @@ def test_a_drive_that_the_method_cannot_use_has_the_reasons():
     result = predict(moving, Sigmas(config=config()))
     assert Code.NO_STANDSTILL in {r.code for r in result.reasons}
     # the same speed at start and end: the latency cancels, with fixes of a second on each side
-    assert result.standing == (0.0, 0.0)
+    assert result.rests == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(('change', 'words'), [
@@ -166,14 +166,14 @@ def test_each_change_of_a_drive_changes_only_what_it_states():
     assert longer.duration - drive.duration == pytest.approx(50.0)
     rested = drive.lengthen_rests(60.0)
     assert rested.distance == pytest.approx(drive.distance, rel=1e-9)
-    before, after = (predict(d, Sigmas(config=config())).standing for d in (drive, rested))
+    before, after = (predict(d, Sigmas(config=config())).rests for d in (drive, rested))
     assert np.subtract(after, before) == pytest.approx([60.0, 60.0], abs=1e-6)
     other = predict(drive.turn_around(), Sigmas(config=config()))
     assert other.sigma(SCALE) == pytest.approx(
         predict(drive, Sigmas(config=config())).sigma(SCALE), rel=1e-3)
     half = drive.cut_at(300.0, 20.0)
     assert half.distance == pytest.approx(20 * 300 - 400, rel=1e-2)
-    assert predict(half, Sigmas(config=config())).standing[1] == pytest.approx(20.0, abs=0.2)
+    assert predict(half, Sigmas(config=config())).rests[1] == pytest.approx(20.0, abs=0.2)
 
 
 def test_yaw_of_a_recorded_leg_is_corrected_for_the_gyro_bias_at_rest():

@@ -196,18 +196,18 @@ def test_remaining_seconds_of_standstill_are_stated():
      'the course over ground, which includes it: set alignment.heading_source)'),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {},
      'observable: the scale, the yaw (from the configured heading, 0.11 deg) and the pitch'),
-    ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.02}, {'height': False},
+    ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.02}, {'has_height': False},
      'observable: the scale; not observable: the yaw to 0.5 deg (the configured heading has an '
      'uncertainty of 1.1 deg); the pitch (fixes without height)'),
     ({}, {'variances': NONE | {'heading_topic': 0.001**2}},
      'observable: the scale, the yaw (from the heading topic, 0.057 deg) and the pitch'),
-    ({'imu.grade': 'navigation'}, {'rested_s': 600.0},
+    ({'imu.grade': 'navigation'}, {'rest_s': 600.0},
      'observable: the scale, the yaw (from the gyrocompass, '),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {'two_wheels': True},
      'observable: the scale, the yaw (from the configured heading, 0.11 deg), the pitch, left '
      'and right wheel and the track width (needs turns)'),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002, 'odometer.track_width': 1.6},
-     {'two_wheels': True, 'rested_s': 1.0},
+     {'two_wheels': True, 'rest_s': 1.0},
      'observable: the scale, the yaw (from the configured heading, 0.11 deg), the pitch and left '
      'and right wheel; level and gyro bias are estimated from the drive, because it starts '
      'without a standstill'),
@@ -217,7 +217,7 @@ def test_remaining_seconds_of_standstill_are_stated():
      'their mean)')])
 def test_observable_quantities_are_stated_beforehand(monkeypatch, settings, received, expected):
     monkeypatch.setattr(quantities, 'METHODS', ('two_point',))
-    known = Received(**({'variances': NONE, 'rested_s': 30.0} | received))
+    known = Received(**({'variances': NONE, 'rest_s': 30.0} | received))
     text = find_observable(with_settings(CONFIG, settings), known).as_text()
     assert text.startswith(expected) if expected.endswith(', ') else text == expected
 

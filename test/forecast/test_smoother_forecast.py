@@ -35,7 +35,7 @@ def test_sigmas_are_of_the_method_that_gives_the_result(exact, updates):
     assert found.scale.sigma == pytest.approx(e['scale_factor'].sigma / e['scale_factor'].value)
     assert found.yaw.sigma == pytest.approx(e['yaw_mounting_angle'].sigma)
     assert found.pitch == pytest.approx(e['pitch_mounting_angle'].sigma)
-    assert (found.scale.remaining_m, found.yaw.remaining_m, found.complete) == (0.0, 0.0, True)
+    assert (found.scale.remaining_m, found.yaw.remaining_m, found.is_complete) == (0.0, 0.0, True)
     assert found.until_ns == updates[-1].leg.stop_ns
     ends = forecast_at(updates[-1], exact, method='two_point')
     assert ends.estimates == {}
@@ -109,7 +109,7 @@ def test_the_yaw_requires_stops_and_starts_until_it_is_within_the_limit(updates)
     assert found.yaw.remaining_m == pytest.approx(1500.0)
     assert found.yaw.as_text('yaw', 'deg', math.degrees(1)).endswith(
         ' ± 1.15 deg so far (limit 0.57)')
-    assert not found.complete
+    assert not found.is_complete
     assert of_sigmas(updates[-1],
                      yaw=0.0105).yaw.manoeuvre.startswith('for the yaw: stop and start 1 ')
     assert of_sigmas(updates[-1],
@@ -119,7 +119,7 @@ def test_the_yaw_requires_stops_and_starts_until_it_is_within_the_limit(updates)
     assert never.yaw.as_text('yaw', 'deg', math.degrees(1)) == (
         'yaw is not determined yet (2.86 deg)')
     good = of_sigmas(updates[-1], yaw=0.009)
-    assert (good.yaw.manoeuvre, good.yaw.remaining_m, good.complete) == ('', 0.0, True)
+    assert (good.yaw.manoeuvre, good.yaw.remaining_m, good.is_complete) == ('', 0.0, True)
 
 
 def test_the_hint_states_the_value_what_is_missing_and_its_age(updates):

@@ -16,7 +16,7 @@ from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.estimator import growing
 from odocal_ros.estimator.growing import extend_warm_start, make_imu_steps, UPDATE_PASSES
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.forecast.forecast import Abandoned
+from odocal_ros.forecast.forecast import LegEnded
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import with_settings
@@ -171,7 +171,7 @@ def test_an_update_stops_between_passes_and_the_next_is_a_cold_start(exact, upda
         required.append(True)
         return len(required) <= allowed
 
-    with pytest.raises(Abandoned):
+    with pytest.raises(LegEnded):
         so_far.update(updates[0].leg, exact, is_needed)
     assert len(required) == allowed + 1
     assert so_far.update(updates[0].leg, exact).sigmas.shape == (3,)

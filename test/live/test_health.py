@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.progress import Clocks, FixPath, OdometerProgress, Progress, scale_so_far
+from odocal_ros.forecast.progress import Clocks, FixPath, OdometerProgress, Progress
 from odocal_ros.live.health import Health
 from odocal_ros.settings.config import Config, with_settings
 
@@ -134,10 +134,11 @@ def travelled(*blocks, form=COUNTER, scale=0.02):
 def test_the_distance_is_right_across_a_rollover_and_a_reset_adds_none():
     counts = [65000, 65300, 64, 364, 664] # 300 counts each, over 65536
     for cut in range(1, 5):
-        assert travelled((range(cut), counts[:cut]), (range(cut, 5), counts[cut:])).total == 1200
+        travel = travelled((range(cut), counts[:cut]), (range(cut, 5), counts[cut:]))
+        assert travel.path_length == 1200
     travel = travelled((range(4), [900000, 900100, 0, 100]),
                        form=OdometerForm('cumulative', 2**64, 'm/pulse'))
-    assert travel.total == 200  # 18 km in a second is a reset
+    assert travel.path_length == 200  # 18 km in a second is a reset
 
 
 @pytest.mark.parametrize(('quantity', 'unit', 'scale', 'values', 'metres'), [
@@ -145,7 +146,7 @@ def test_the_distance_is_right_across_a_rollover_and_a_reset_adds_none():
     ('rate', '1', 1.0, [2.0, 2.0, 3.0], 5.0), ('cumulative', 'm/rad', 0.3, [1.0, 2.0, 4.0], 0.9)])
 def test_every_quantity_gives_metres(quantity, unit, scale, values, metres):
     travel = travelled((range(3), values), form=OdometerForm(quantity, 0, unit), scale=scale)
-    assert travel.total * scale == pytest.approx(metres)
+    assert travel.path_length * scale == pytest.approx(metres)
 
 
 def test_a_clock_that_is_set_back_gives_no_negative_standstill():
@@ -154,21 +155,21 @@ def test_a_clock_that_is_set_back_gives_no_negative_standstill():
         blocks.append(([t], [200]))
         travel = travelled(*blocks)
         assert travel.still_s() == t - 10
-        assert travel.rested_s(600.0) >= 0
+        assert travel.rest_s(600.0) >= 0
 
 
 def test_standstills_are_detected_with_toggling_counts_and_in_the_preroll():
     standing = range(6), [0, 100, 200, 200, 201, 201]
     assert travelled(standing).still_s() == pytest.approx(3.0)
     assert travelled(standing, ([6], [301])).still_s() == 0.0
-    assert travelled().rested_s(600.0) == 0.0
+    assert travelled().rest_s(600.0) == 0.0
     counts = 100 * np.concatenate([np.arange(6), np.full(10, 5), np.arange(5, 20)])
     stood = np.arange(31), counts        # stands from 5 s to 16 s, drives on to 30 s
     travel = travelled(stood)
     assert travel.still_s() == 0.0
-    assert travel.rested_s(600.0) == pytest.approx(11.0, abs=1.0)
-    assert travel.rested_s(10.0) == 0.0
-    assert travelled(stood, ([31, 40], [1900, 1900])).rested_s(10.0) == pytest.approx(10.0)
+    assert travel.rest_s(600.0) == pytest.approx(11.0, abs=1.0)
+    assert travel.rest_s(10.0) == 0.0
+    assert travelled(stood, ([31, 40], [1900, 1900])).rest_s(10.0) == pytest.approx(10.0)
 
 
 def fixes(latitude, **columns):
@@ -184,19 +185,20 @@ def test_the_path_length_of_the_fixes_excludes_their_noise():
     north = 1e-7 * np.array([0.0, 1.0, 0.0, 1.0, 0.0])     # 0.6 m of jitter
     drive = 0.7 + np.concatenate([north, 10e-7 * np.arange(1, 11)])  # then 63.7 m in 6.4 m steps
     path = FixPath()
-    path.feed(fixes(drive, status=np.full(len(drive), -1)), 0, moving=True)
-    assert path.total == 0.0
-    path.feed(fixes(drive), 0, moving=True)
-    assert path.total == pytest.approx(63.6, abs=0.7)   # the jitter may shift the first anchor
-    assert path.top == pytest.approx(6.36, abs=0.7)
+    path.feed(fixes(drive, status=np.full(len(drive), -1)), 0, is_moving=True)
+    assert path.path_length == 0.0
+    path.feed(fixes(drive), 0, is_moving=True)
+    # the jitter may shift the first anchor
+    assert path.path_length == pytest.approx(63.6, abs=0.7)
+    assert path.top_speed == pytest.approx(6.36, abs=0.7)
 
 
 @pytest.mark.parametrize('odd', [1e200, -1e308, np.inf, np.nan, 2.0])
 def test_an_impossible_fix_adds_no_path_length(odd):
     path = FixPath()
     with np.errstate(all='raise'):
-        path.feed(fixes(np.array([0.7, 0.7, odd, 0.7, 0.7])), 0, moving=True)
-    assert (path.total, path.top) == (0.0, 0.0)
+        path.feed(fixes(np.array([0.7, 0.7, odd, 0.7, 0.7])), 0, is_moving=True)
+    assert (path.path_length, path.top_speed) == (0.0, 0.0)
 
 
 def test_fix_noise_adds_no_path_length_while_the_counter_stands():
@@ -226,7 +228,7 @@ def test_a_burst_of_counts_does_not_increase_the_maximum_speed():
     t = np.arange(0.0, 20.0, 0.02)
     late = np.where(t % 5.0 < 0.12, t - t % 5.0 + 0.12 + (t % 5.0) / 100, t) + 1000
     travel = travelled(*(([late[k]], [int(10 * t[k] / 0.02)]) for k in range(len(t))))
-    assert travel.top * 0.02 == pytest.approx(10.0, rel=0.15)
+    assert travel.top_speed * 0.02 == pytest.approx(10.0, rel=0.15)
 
 
 def test_a_burst_of_messages_is_not_reported_as_a_clock_difference():
@@ -238,19 +240,24 @@ def test_a_burst_of_messages_is_not_reported_as_a_clock_difference():
         clocks.feed('imu', rows(stamps[:2], received_s=arrival[:2]))
         clocks.feed('odometer', rows(stamps[2:], received_s=arrival[2:]))
         clocks.feed('imu', rows(stamps[2:] + 0.01, received_s=arrival[2:] + 1e-4))
-    assert clocks.differing(config) == []
+    assert clocks.find_differing(config) == []
 
 
 def test_the_scale_of_the_hint_is_the_best_known_one():
     config = with_settings(Config(), {'wheels.radius': 0.3, 'wheels.pulses_per_revolution': 100.0})
     angle, speed = OdometerForm('cumulative', 0, 'm/rad'), OdometerForm('rate', 0, '1')
-    assert scale_so_far(Config(), COUNTER) == 0.0
-    assert scale_so_far(config, COUNTER) == pytest.approx(2 * np.pi * 0.003)
-    assert scale_so_far(config, angle) == 0.3
-    assert scale_so_far(config, speed) == 1.0
+
+    def scale(config, form, known=np.nan):
+        progress = Progress()
+        progress.feed('odometer', rows([1.0, 2.0]), config, form, known)
+        return progress._scale
+    assert scale(Config(), COUNTER) == 0.0
+    assert scale(config, COUNTER) == pytest.approx(2 * np.pi * 0.003)
+    assert scale(config, angle) == 0.3
+    assert scale(config, speed) == 1.0
     named = with_settings(config, {'odometer.nominal_scale': 0.019})
-    assert scale_so_far(named, COUNTER) == 0.019
-    assert scale_so_far(named, COUNTER, estimated=0.0188) == 0.0188
+    assert scale(named, COUNTER) == 0.019
+    assert scale(named, COUNTER, known=0.0188) == 0.0188
 
 
 def test_clocks_are_compared_between_rows_that_arrived_together():
@@ -261,11 +268,11 @@ def test_clocks_are_compared_between_rows_that_arrived_together():
         clocks.feed('imu', rows((arrival - 1000) * 10 + 50, received_s=arrival))
         clocks.feed('fix', rows([(arrival[4] - 1000) * 10 + 50 - 0.3], received_s=[arrival[4]]))
         clocks.feed('odometer', rows([(arrival[4] - 1000) * 10 + 50.7], received_s=[arrival[4]]))
-    assert clocks.differing(config) == [('odometer', pytest.approx(0.7, abs=1e-6))]
+    assert clocks.find_differing(config) == [('odometer', pytest.approx(0.7, abs=1e-6))]
     aligned = with_settings(config, {'odometer.time_offset': -0.7})
-    assert clocks.differing(aligned) == []
-    assert [s for s, _ in clocks.differing(with_settings(aligned, {'imu.time_offset': 0.9}))] == [
-        'fix', 'odometer']
+    assert clocks.find_differing(aligned) == []
+    late = with_settings(aligned, {'imu.time_offset': 0.9})
+    assert [slot for slot, _ in clocks.find_differing(late)] == ['fix', 'odometer']
     # two synchronous sensors: in each tick the IMU row arrives first and the other row last
     clocks = Clocks()
     for i in range(20):
@@ -273,4 +280,4 @@ def test_clocks_are_compared_between_rows_that_arrived_together():
         clocks.feed('imu', rows((arrival - 1000) * 10 + 50, received_s=arrival))
         late = arrival + 0.002
         clocks.feed('odometer', rows((late - 1000) * 10 + 50.7, received_s=late))
-    assert clocks.differing(config) == [('odometer', pytest.approx(0.7, abs=1e-6))]
+    assert clocks.find_differing(config) == [('odometer', pytest.approx(0.7, abs=1e-6))]
