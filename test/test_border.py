@@ -39,7 +39,7 @@ PACKAGES = {
     'live': 'apply bagio calib data forecast messages output safe_io pattern pipeline settings',
     'library': 'bagio calib data estimator forecast messages nav output safe_io pipeline '
                'screening settings sim',
-    'offline': 'bagio calib data estimator forecast library messages nav output safe_io pipeline '
+    'offline': 'bagio calib data forecast library messages nav output safe_io pipeline '
                'screening settings sim',
     'fleet': 'bagio calib library nav offline safe_io output pipeline settings'}
 COMMON = {'errors', 'reasons'}

@@ -157,7 +157,7 @@ def with_heading(config: Config, variances: dict[str, float]) -> Config:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that the operator is told about."""
+    """A quantity whose limit is shown to the operator."""
 
     label: str                           # for people
     estimates: tuple[str, ...]           # names of its estimates in a result
