@@ -4,13 +4,13 @@
 """
 The content of a bag for odocal inspect and try, as one dict that becomes text or JSON.
 
-In: an open bag. Out: facts of each topic, the most likely topic of each input, facts of the drive,
-findings (problems and missing data), and the replay command with the settings that it needs.
+It has facts of each topic, the most likely topic of each input, facts of the drive, findings
+(problems and missing data), and the replay command with the settings that the bag needs.
 """
 
 from collections.abc import Sequence
 from datetime import datetime, UTC
-from typing import Any
+from typing import Any, NamedTuple
 
 from odocal_ros.bagio.read import Bag, TopicInfo
 from odocal_ros.data.arrays import Ints
@@ -44,24 +44,24 @@ TWO_POINT_CODES = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARA
 class _TopicSamples:
     """A reader that stores its samples; an error is stored in ``error``, for other topics."""
 
-    unreadable = 0      # as the bag sees it: one bad topic must not end the reading of the others
+    unreadable = 0      # for the bag: one bad topic must not end the reading of the others
 
     def __init__(self, reader: Reader) -> None:
         self.reader, self.recorder, self.error = reader, LegRecorder(), ''
         has_list = reader.msgtype in wheel_survey.FIELDS
-        self.values = wheel_survey.ListCollector(reader.msgtype) if has_list else None
+        self.lists = wheel_survey.ListCollector(reader.msgtype) if has_list else None
         self.form_by_fixes: OdometerForm | None = None
 
     @property
     def form(self) -> OdometerForm | None:
-        """Return the meaning of odometer values: by the fixes if found, else by the type."""
+        """Return the meaning of odometer values: by the fixes if known, else by the type."""
         return self.form_by_fixes or self.reader.form
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
         """Store the samples of a block of messages; return none."""
-        if self.values:
-            self.values.rows(raws, received_ns)
+        if self.lists:
+            self.lists.rows(raws, received_ns)
         try:
             for slot, block in self.reader.rows(raws, received_ns, deserialize):
                 self.recorder.feed(slot, block)
@@ -70,43 +70,25 @@ class _TopicSamples:
         return []
 
 
+class _Selection(NamedTuple):
+    """The most likely topics of a bag."""
+
+    mapping: dict[str, str]         # slot -> topic
+    not_following: set[str]         # odometers that do not follow the fixes, while another does
+    topics: list[dict[str, Any]]    # facts of all topics
+    initial_config: Config          # the settings given, with those by the names of topics
+    options: list[str]              # settings that the odometer needs
+
+
 def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> dict[str, Any]:
     """
     Return the content of a bag, as for ``odocal inspect --json``.
 
     Times are seconds from the bag's first message, angles rad, the rest SI.
     """
-    samples_by_topic, refused = _make_samples(bag, config, overrides)
-    collectors = odometer_search.make_collectors(bag.topics, samples_by_topic, overrides.values())
-    # these readers store samples and return none, so that the second argument is not called
-    bag.read({**samples_by_topic, **collectors, **_static_readers(samples_by_topic, bag)}, print)
-    # first by names and types only; again after the comparison with the fixes
-    mapping, config = likely_mapping(bag.topics, config, overrides)
-    imu, fix = (samples_by_topic.get(mapping.get(slot, '')) for slot in ('imu', 'fix'))
-    turn_rate = survey.turn_rate_to_left(imu.recorder.rows('imu')) if imu else None
-    fixes = fix_path(fix.recorder.rows('fix'), config.gnss) if fix else None
-    motions = {name: topic_samples.values.facts(turn_rate, fixes)
-               for name, topic_samples in samples_by_topic.items() if topic_samples.values}
-    matches = _matches(bag, samples_by_topic, motions, fixes, config) if fixes else {}
-    not_following = odometer_search.topics_not_following(matches)
-    mapping, initial_config = likely_mapping(bag.topics, config, overrides, not_following)
-    topics = [_topic_facts(bag, info, samples_by_topic.get(name), refused.get(name, ''))
-              for name, info in bag.topics.items()]
-    for facts in topics:
-        if 'odometer' in facts:
-            facts['odometer']['not_following'] = facts['name'] in not_following
-        if fixes and (fields := collectors.get(facts['name'])) and not fields.error:
-            facts['fields'] = fields.facts(fixes)
-    odometer_search.drop_weak_fields([facts['fields'] for facts in topics if 'fields' in facts])
-    no_topic_follows = 'odometer' not in overrides and matches and not any(
-        match.follows for match in matches.values())
-    if (mapping.get('odometer') not in samples_by_topic or no_topic_follows) and (
-            best := odometer_search.best_topic(topics, overrides.get('odometer', ''))):
-        mapping.pop('odometer_right', None)
-        mapping['odometer'] = best['name']
-        options = collectors[best['name']].settings(best['fields']['found'], turn_rate)
-    else:
-        options = _wheel_options(samples_by_topic, mapping, initial_config, topics, motions)
+    samples_by_topic, errors = _make_samples(bag, config, overrides)
+    mapping, not_following, topics, initial_config, options = _select_topics(
+        bag, samples_by_topic, errors, config, overrides)
     config = with_settings(initial_config, dict(map(parse_set, options)))
     if options:
         _read_again(bag, samples_by_topic, mapping['odometer'], config, topics)
@@ -127,6 +109,49 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
                                   options)}))
 
 
+def _select_topics(bag: Bag, samples_by_topic: dict[str, _TopicSamples], errors: dict[str, str],
+                   config: Config, overrides: dict[str, str]) -> _Selection:
+    """Read all possible inputs; return the topics by names, types, and the path of the fixes."""
+    collectors = odometer_search.make_collectors(bag.topics, samples_by_topic, overrides.values())
+    # these readers store samples and return none, so that the second argument is not called
+    bag.read({**samples_by_topic, **collectors, **_static_readers(samples_by_topic, bag)}, print)
+    # first by names and types only; again after the comparison with the fixes
+    mapping, config = likely_mapping(bag.topics, config, overrides)
+    imu, fix = (samples_by_topic.get(mapping.get(slot, '')) for slot in ('imu', 'fix'))
+    turn_rate = survey.turn_rate_to_left(imu.recorder.rows('imu')) if imu else None
+    fixes = fix_path(fix.recorder.rows('fix'), config.gnss) if fix else None
+    motions = {name: topic_samples.lists.facts(turn_rate, fixes)
+               for name, topic_samples in samples_by_topic.items() if topic_samples.lists}
+    matches = _matches(bag, samples_by_topic, motions, fixes, config) if fixes else {}
+    not_following = odometer_search.topics_not_following(matches)
+    mapping, config = likely_mapping(bag.topics, config, overrides, not_following)
+    fields = {name: collector.facts(fixes) for name, collector in collectors.items()
+              if fixes and not collector.error}
+    odometer_search.drop_weak_fields(fields.values())
+    # an odometer of another type is suggested if no topic with a reader is one
+    needs_field = mapping.get('odometer') not in samples_by_topic or (
+        'odometer' not in overrides and matches and not any(
+            match.follows for match in matches.values()))
+    field_topic = odometer_search.best_topic(
+        fields, overrides.get('odometer', '')) if needs_field else ''
+    if field_topic:
+        mapping.pop('odometer_right', None)
+        mapping['odometer'] = field_topic
+        options = collectors[field_topic].settings(fields[field_topic]['found'], turn_rate)
+    else:
+        options = _wheel_options(samples_by_topic, mapping, config, motions)
+    topics = [_topic_facts(bag, info, samples_by_topic.get(name), errors.get(name, ''))
+              for name, info in bag.topics.items()]
+    for facts in topics:
+        name = facts['name']
+        if 'odometer' in facts:
+            facts['odometer']['not_following'] = name in not_following
+        facts |= {'fields': fields[name]} if name in fields else {}
+        if name in motions and not field_topic:
+            facts |= _list_facts(samples_by_topic[name].reader, motions[name])
+    return _Selection(mapping, not_following, topics, config, options)
+
+
 def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
     return {
         'bag': bag.name, 'path': path, 'files': [str(f) for f in bag.files],
@@ -138,7 +163,7 @@ def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
 
 def _finding_facts(findings: list[Reason], config: Config,
                    options: list[str]) -> list[dict[str, Any]]:
-    """Return findings as facts; ``method`` : the only one that they affect, None: all."""
+    """Return findings as dicts; ``method``: the only one that a finding affects, None: all."""
     has_wheels = config.odometer.wheel_keys or any(
         option.startswith(('odometer.left=', 'odometer.wheels=')) for option in options)
     codes = TWO_POINT_CODES - {Code.NO_STANDSTILL} if has_wheels else TWO_POINT_CODES
@@ -149,10 +174,10 @@ def _finding_facts(findings: list[Reason], config: Config,
 
 def _make_samples(bag: Bag, config: Config,
                   overrides: dict[str, str]) -> tuple[dict[str, _TopicSamples], dict[Any, Any]]:
-    """Return topic -> samples of every possible input, and topic -> error of unusable ones."""
+    """Return topic -> samples of every possible input, and topic -> error without a reader."""
     slot_by_topic = {topic: slot for slot, topic in overrides.items()}
     samples_by_topic: dict[str, _TopicSamples] = {}
-    refused: dict[str, str] = {}
+    errors: dict[str, str] = {}
     for name, info in bag.topics.items():
         slot = slot_by_topic.get(name) or ('imu' if info.msgtype == IMU else '') or (
             'fix' if info.msgtype in REFERENCES else '') or (
@@ -163,8 +188,8 @@ def _make_samples(bag: Bag, config: Config,
         try:
             samples_by_topic[name] = _TopicSamples(make_reader(slot, info.msgtype, config))
         except OdocalError as error:
-            refused[name] = str(error)
-    return samples_by_topic, refused
+            errors[name] = str(error)
+    return samples_by_topic, errors
 
 
 def _static_readers(samples_by_topic: dict[str, _TopicSamples],
@@ -215,8 +240,8 @@ def _matches(bag: Bag, samples_by_topic: dict[str, _TopicSamples],
     """
     Return the comparison of each odometer topic with the path of the fixes.
 
-    motions : motion of each value of topics of lists. A topic of one number that follows the path
-    only with another meaning gets this meaning.
+    motions : of each value of a topic with lists. A topic of one number that only follows the path
+    with another meaning gets this meaning.
     """
     following = {name: any(value['scale'] for value in values)
                  for name, values in motions.items() if values}
@@ -231,33 +256,30 @@ def _matches(bag: Bag, samples_by_topic: dict[str, _TopicSamples],
     return matches
 
 
+def _list_facts(reader: Reader, values: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the facts of a topic with lists, from the motion of its values."""
+    form = reader.form
+    return {'values': values,
+            **({'motions': wheel_survey.motion_texts(values)} if len(values) > 1 else {}),
+            **({'chosen': form.selection_text} if form and form.selection_text else {})}
+
+
 def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str, str],
-                   config: Config, topics: list[dict[str, Any]],
-                   motions: dict[str, list[dict[str, Any]]]) -> list[str]:
-    """Return the settings for the odometer; add the motion of each joint to ``topics``."""
+                   config: Config, motions: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """Return the settings for the selected odometer topic: its wheels, or its meaning."""
+    topic = mapping.get('odometer', '')
+    odometer = samples_by_topic.get(topic)
     options: list[str] = []
-    is_unconfigured = not (config.odometer.wheel_keys or config.odometer.field)
-    for facts in topics:
-        if facts['name'] not in motions:
-            continue
-        topic_samples, values = samples_by_topic[facts['name']], motions[facts['name']]
-        facts['values'] = values
-        if len(values) > 1:
-            facts['motions'] = wheel_survey.motion_texts(values)
-        form = topic_samples.reader.form
-        assert form is not None      # a topic of lists is an odometer's
-        if form.selection_text:
-            facts['chosen'] = form.selection_text
-        if facts['name'] == mapping.get('odometer') and is_unconfigured:
-            named = topic_samples.reader.wheels if form.sides_known else ()
-            rolling = {value['key'] for value in values if value['rolls']}
-            if len(named) > 1 and rolling.issuperset(named):
-                options += [f'odometer.{side}={key}' for side, key in zip(
-                    SIDES, named, strict=True)]
-            else:
-                options += wheel_survey.wheel_settings(values) or (
-                    wheel_survey.single_wheel_setting(values, topic_samples.reader.wheels))
-    odometer = samples_by_topic.get(mapping.get('odometer', ''))
+    if odometer and topic in motions and not (
+            config.odometer.wheel_keys or config.odometer.field):
+        values, wheels, form = motions[topic], odometer.reader.wheels, odometer.reader.form
+        named = wheels if form and form.sides_known else ()
+        rolling = {value['key'] for value in values if value['rolls']}
+        if len(named) > 1 and rolling.issuperset(named):
+            options += [f'odometer.{side}={key}' for side, key in zip(SIDES, named, strict=True)]
+        else:
+            options += wheel_survey.wheel_settings(values) or (
+                wheel_survey.single_wheel_setting(values, wheels))
     if odometer and odometer.form_by_fixes:
         options.append(f'odometer.quantity={odometer.form_by_fixes.quantity}')
     return options
@@ -265,7 +287,7 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
 
 def _read_again(bag: Bag, samples_by_topic: dict[str, _TopicSamples], topic: str, config: Config,
                 topics: list[dict[str, Any]]) -> None:
-    """Read the odometer with the settings found; add its facts to ``topics``."""
+    """Read the odometer with the suggested settings; add its facts to ``topics``."""
     reader = make_reader('odometer', bag.topics[topic].msgtype, config)
     topic_samples = samples_by_topic[topic] = _TopicSamples(reader)
     bag.read({topic: topic_samples}, print)
@@ -280,14 +302,14 @@ def _combined_recorder(samples_by_topic: dict[str, _TopicSamples],
     for slot, topic in mapping.items():
         if topic not in samples_by_topic:
             continue
-        rows = samples_by_topic[topic].recorder
+        reader, source = samples_by_topic[topic].reader, samples_by_topic[topic].recorder
         if slot == 'odometer':
-            recorder.form = samples_by_topic[topic].reader.form or recorder.form
-            for more in WHEELS[1:]:
-                recorder.adopt(more, rows, more)
+            recorder.form = reader.form or recorder.form
+            for wheel in WHEELS[1:]:
+                recorder.adopt(wheel, source, wheel)
         if slot == 'odometer_right':
-            recorder.form_right = samples_by_topic[topic].reader.form
-            recorder.adopt(slot, rows, 'odometer')
-        elif samples_by_topic[topic].reader.slot == slot:
-            recorder.adopt(slot, rows, slot)
+            recorder.form_right = reader.form
+            recorder.adopt(slot, source, 'odometer')
+        elif reader.slot == slot:
+            recorder.adopt(slot, source, slot)
     return recorder

@@ -1,11 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Search for an odometer in messages of other types, such as those of a vehicle bus."""
+"""
+Search for an odometer in messages of other types, such as those of a vehicle bus.
+
+A number of a message is an odometer if it, or its integral, is proportional to the distance
+between the fixes.
+"""
 
 from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import islice
+import math
 from numbers import Integral
 import re
 from typing import Any
@@ -57,11 +63,12 @@ class FieldCollector:
         k = -self._message_count % self._stride
         self._message_count += len(raws)
         while k < len(raws) and not self.error:      # the first message sets the stride
-            self._take(raws[k], int(received_ns[k]), deserialize)
+            self._store(raws[k], int(received_ns[k]), deserialize)
             k += self._stride
         return []
 
-    def _take(self, raw: bytes, time_ns: int, deserialize: Deserialize) -> None:
+    def _store(self, raw: bytes, time_ns: int, deserialize: Deserialize) -> None:
+        """Store the numbers of a message; one that differs from the first message is skipped."""
         try:
             view = MessageView(deserialize(raw) if len(raw) <= MAX_BYTES else None)
             if not self.paths:
@@ -84,10 +91,11 @@ class FieldCollector:
             raise BadData('no numeric field')
         self.paths = [path for path, _ in numbers]
         self.is_integer = [isinstance(value, Integral) for _, value in numbers]
-        self._stride = max(1, -(-self.count // min(MAX_MESSAGES, MAX_VALUES // len(numbers))))
+        max_messages = min(MAX_MESSAGES, MAX_VALUES // len(numbers))
+        self._stride = math.ceil(self.count / max_messages)
 
     def facts(self, path: FixPath) -> dict[str, Any]:
-        """Return the number of fields and those that follow the path of the fixes."""
+        """Return the number of fields, ``tried``, and those that follow the path, ``found``."""
         t_ns = np.array(self._times, np.int64)
         values = np.array(self._values).reshape(len(t_ns), len(self.paths))
         keep = np.append(True, np.diff(t_ns) > 0)[:len(t_ns)] & np.isfinite(values).all(axis=1)
@@ -98,7 +106,7 @@ class FieldCollector:
         self._travel = {field['path']: travel for field, travel in matching}
         return {'tried': len(self.paths), 'found': [
             field | {'settings': _settings(field, f'odometer.field={field["path"]}')}
-            for field in sorted((field for field, _ in matching), key=rank)]}
+            for field in sorted((field for field, _ in matching), key=_sort_key)]}
 
     def settings(self, fields: Sequence[dict[str, Any]],
                  turn_rate: tuple[Ints, Floats] | None) -> list[str]:
@@ -108,16 +116,16 @@ class FieldCollector:
         fields : of ``facts``.   turn_rate : times, ns, and rate to the left, rad/s, if known.
         """
         best, t_ns = fields[0], self._t_ns
-        scale_tolerance = 0.3  # judgement: scales of the wheels of a vehicle differ less, relative
+        scale_tolerance = 0.3  # judgement: relative difference between wheels of a vehicle
         wheels = [field for field in fields if all(
             field[key] == best[key] for key in ('quantity', 'wrap', 'is_integer'))
             and abs(field['scale'] / best['scale'] - 1) < scale_tolerance]
         if turn_rate is not None and 1 < len(wheels) <= len(WHEELS):
             s = np.stack([self._travel[field['path']] for field in wheels], -1)
-            named = find_sides((t_ns - t_ns[0]) * 1e-9, s, np.ones(len(wheels), bool),
+            sides = find_sides((t_ns - t_ns[0]) * 1e-9, s, np.ones(len(wheels), bool),
                                ((turn_rate[0] - t_ns[0]) * 1e-9, turn_rate[1]))
             if options := wheel_settings([{'key': field['path'], 'side': side}
-                                          for field, side in zip(wheels, named, strict=True)]):
+                                          for field, side in zip(wheels, sides, strict=True)]):
                 return _settings(best, *options)
         return list(best['settings'])
 
@@ -130,8 +138,8 @@ def _settings(field: dict[str, Any], *names: str) -> list[str]:
             *['odometer.reversed=true'] * (field['scale'] < 0)]
 
 
-def rank(field: dict[str, Any]) -> tuple[bool, float]:
-    """Return a sort key: counters before speeds, then the share of the variance explained."""
+def _sort_key(field: dict[str, Any]) -> tuple[bool, float]:
+    """Return the sort key of a field, the best first: counters, then the explained variance."""
     return field['quantity'] != 'cumulative', -round(field['explained'], 3)
 
 
@@ -158,9 +166,10 @@ def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
 def _best_meaning(path: str, is_integer: bool, t_ns: Ints, value: Floats, fixes: FixPath,
                   stride: int) -> tuple[dict[str, Any], Floats] | None:
     """
-    Return the meaning of a field that follows the path best, and its travel; or None.
+    Return the meaning with which a field follows the path best, and its travel; None if none does.
 
-    The scale is in m per unit, or m/s for a rate.
+    t_ns, value : (n,) arrival times and numbers of every stride-th message. The scale of the
+    meaning is in m per unit, or m/s per unit for a rate.
     """
     matching: list[tuple[dict[str, Any], Floats]] = []
     seconds: Floats = np.multiply(t_ns - t_ns[:1], 1e-9)
@@ -169,7 +178,7 @@ def _best_meaning(path: str, is_integer: bool, t_ns: Ints, value: Floats, fixes:
         wrap = _rollover(value) if counts else 0
         s = make_travel(seconds, value.astype(np.int64) if counts else value,
                         OdometerForm(quantity, wrap, ''))[0].s
-        s = s * stride if quantity == 'increment' else s
+        s = s * stride if quantity == 'increment' else s      # of messages in between
         match = fixes.match(t_ns, s)
         if match.follows:
             matching.append(({
@@ -245,7 +254,7 @@ def topics_not_following(matches: Mapping[str, Match]) -> set[str]:
     return {topic for topic, match in matches.items() if not match.follows}
 
 
-def drop_weak_fields(fields: Sequence[dict[str, Any]]) -> None:
+def drop_weak_fields(fields: Collection[dict[str, Any]]) -> None:
     """Remove fields that explain much less of the variance than the best of all topics."""
     best = max((field['explained'] for facts in fields for field in facts['found']), default=0.0)
     # removes all false signals of benchmarks/odometer_fields.py but energy with fixes of 2.5 m
@@ -255,8 +264,12 @@ def drop_weak_fields(fields: Sequence[dict[str, Any]]) -> None:
                           if 1 - field['explained'] <= variance_factor * (1 - best) + least]
 
 
-def best_topic(topics: Sequence[dict[str, Any]], requested: str) -> dict[str, Any] | None:
-    """Return the topic whose field follows the path best, only ``requested`` if set, or None."""
-    matching = [facts for facts in topics if facts.get('fields', {}).get('found') and (
-        not requested or facts['name'].strip('/') == requested.strip('/'))]
-    return min(matching, default=None, key=lambda facts: rank(facts['fields']['found'][0]))
+def best_topic(fields: Mapping[str, dict[str, Any]], requested: str) -> str:
+    """
+    Return the topic whose field follows the path best, '' without one.
+
+    fields : ``FieldCollector.facts`` by topic.   requested : the only possible topic, if set.
+    """
+    matching = [name for name, facts in fields.items() if facts['found'] and (
+        not requested or name.strip('/') == requested.strip('/'))]
+    return min(matching, default='', key=lambda name: _sort_key(fields[name]['found'][0]))

@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Facts that odocal inspect computes from samples, as dicts: see ``inspection.inspect``."""
+"""
+Facts on each topic for odocal inspect, as dicts, and the path of the fixes.
+
+An odometer is recognised by its travel, which is proportional to the length of that path.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -44,10 +48,10 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
     """
     Return rate, gaps and irregular stamps of a topic.
 
-    ``at`` is in seconds from the bag's first message; ``header_to_bag`` is the median delay from
-    header stamp to recording, s, and ``header_to_bag_spread`` its standard deviation, None without
-    a header; ``arrival_jitter`` is the standard deviation of arrivals without a header, s;
-    ``whole_seconds``: the stamps are rounded down to seconds.
+    ``gaps``: the ten longest, ``at`` in seconds from the bag's first message; ``header_to_bag``:
+    median delay from header stamp to recording, s, and ``header_to_bag_spread`` its standard
+    deviation, None without a header; ``arrival_jitter``: standard deviation of arrivals without a
+    header, s; ``whole_seconds``: the stamps are rounded down to seconds.
     """
     stamped = samples.stamp_ns > 0
     stamp, received = samples.stamp_ns[stamped], samples.received_ns[stamped]
@@ -58,6 +62,7 @@ def timing_facts(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: i
     gaps = np.flatnonzero(step > max(gap_factor * median_step, min_gap))
     longest = gaps[np.argsort(-step[gaps], kind='stable')][:10]
     delay: Floats = np.multiply(received - stamp, 1e-9)
+    # 95 % of a normal distribution are within 4 standard deviations
     spread = None if headerless or not len(delay) else float(
         np.subtract(*np.percentile(delay, [97.5, 2.5])) / 4)
     # mean rate outside the gaps; the median interval would be wrong with bursts
@@ -81,32 +86,34 @@ def imu_facts(samples: ImuSamples) -> dict[str, Any]:
     """
     Return gravity, units and orientation of an IMU topic.
 
-    ``gravity`` is in its unit; ``tilt_from_axis``, rad, is the angle to ``gravity_axis``;
-    ``fastest_turn`` is the 99.9 % quantile of the turn rate; ``yaw_sigma`` is in rad.
+    ``gravity``: median specific force in ``force_unit``; ``gravity_axis``: axis of the IMU next to
+    it, and ``tilt_from_axis`` the angle between them, rad; ``fastest_turn``: 99.9 % quantile of
+    the turn rate, in its unit; ``orientation_refused``: share of messages that state that they
+    have none; ``yaw_sigma``: median stated sigma of the yaw, rad.
     """
     samples = without_invalid_orientations(samples)
     f_i = samples.f_i[~is_impossible('f_i', samples.f_i)]
     w_i = samples.w_i[~is_impossible('w_i', samples.w_i)]
-    mean = medians(f_i) if len(f_i) else np.zeros(3)
-    size = float(np.linalg.norm(mean))
-    axis = int(np.argmax(np.abs(mean)))
+    median_f_i = medians(f_i) if len(f_i) else np.zeros(3)
+    size = float(np.linalg.norm(median_f_i))
+    axis = int(np.argmax(np.abs(median_f_i)))
+    tilt = float(np.arccos(np.clip(abs(median_f_i[axis]) / size, 0, 1))) if size else 0.0
+    units = {'m/s^2': 0.85 * G < size < 1.15 * G, 'g': 0.85 < size < 1.15, 'unknown': True}
     fastest = float(np.percentile(lengths(w_i - medians(w_i)), 99.9)) if len(w_i) else 0.0
     has_orientation = ~np.isnan(samples.yaw_variance)
     rotated = has_orientation & (reduce_columns(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
     variance = samples.yaw_variance[rotated]
-    known = variance[variance > 0]
+    known_variance = variance[variance > 0]
     return {
-        'gravity': size, 'gravity_axis': f'{"+" if mean[axis] > 0 else "-"}{AXES[axis]}',
-        'tilt_from_axis': float(np.arccos(np.clip(abs(mean[axis]) / size, 0, 1))) if size else 0.0,
-        'up_i': (mean / size).tolist() if size else [0.0, 0.0, 0.0],
-        'force_unit': 'm/s^2' if 0.85 * G < size < 1.15 * G else 'g' if 0.85 < size < 1.15
-        else 'unknown',
+        'gravity': size, 'gravity_axis': f'{"+" if median_f_i[axis] > 0 else "-"}{AXES[axis]}',
+        'tilt_from_axis': tilt, 'up_i': (median_f_i / (size or 1.0)).tolist(),
+        'force_unit': next(unit for unit, fits in units.items() if fits),
         'fastest_turn': fastest,
         'not_finite': len(samples.stamp_ns) - min(len(f_i), len(w_i)),
         # an identity that never changes is a default, not an attitude
         'orientation': bool(rotated.mean() > 0.5) if len(rotated) else False,
         'orientation_refused': float((~has_orientation).mean()) if len(has_orientation) else 0.0,
-        'yaw_sigma': float(np.sqrt(np.median(known))) if len(known) else None}
+        'yaw_sigma': float(np.sqrt(np.median(known_variance))) if len(known_variance) else None}
 
 
 def turn_rate_to_left(samples: ImuSamples) -> tuple[Ints, Floats] | None:
@@ -120,12 +127,12 @@ def turn_rate_to_left(samples: ImuSamples) -> tuple[Ints, Floats] | None:
 
 def odometer_facts(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
     """Return quantity, unit and range of an odometer topic."""
-    finite = samples.value[~is_impossible('value', samples.value)]
-    order = np.sort(finite)
-    ends = {'first': finite[:1], 'last': finite[-1:], 'minimum': order[:1], 'maximum': order[-1:]}
+    value = samples.value[~is_impossible('value', samples.value)]
+    extremes = dict.fromkeys(('first', 'last', 'minimum', 'maximum')) if not len(value) else {
+        'first': value[0].item(), 'last': value[-1].item(), 'minimum': value.min().item(),
+        'maximum': value.max().item()}
     return {'quantity': form.quantity, 'scale_unit': form.scale_unit, 'modulus': form.modulus,
-            **{name: x.item() if len(x) else None for name, x in ends.items()},
-            'not_finite': len(samples.value) - len(finite)}
+            **extremes, 'not_finite': len(samples.value) - len(value)}
 
 
 def fix_facts(samples: FixSamples) -> dict[str, Any]:
@@ -134,15 +141,15 @@ def fix_facts(samples: FixSamples) -> dict[str, Any]:
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
         & ~is_impossible('covariance_n', covariance)
     sigma = np.sqrt(covariance[known, :2].max(axis=1)) if known.any() else np.empty(0)
-    has_place = has_position(samples)
-    heights = samples.height[has_place & ~is_impossible('height', samples.height)]
+    positioned = has_position(samples)
+    heights = samples.height[positioned & ~is_impossible('height', samples.height)]
     values, counts = np.unique(samples.status, return_counts=True)
     return {
         'status': dict(zip(map(str, values.tolist()), counts.tolist(), strict=True)),
-        'positions': int(has_place.sum()), 'covariance_known': int(known.sum()),
+        'positions': int(positioned.sum()), 'covariance_known': int(known.sum()),
         'sigma': {'minimum': float(sigma.min()), 'median': float(np.median(sigma)),
                   'maximum': float(sigma.max())} if len(sigma) else None,
-        'position_step': _grid_step(samples.latitude[has_place]),
+        'position_step': _grid_step(samples.latitude[positioned]),
         'height': {'minimum': float(heights.min()), 'maximum': float(heights.max())}
         if len(heights) else None}
 
@@ -186,12 +193,14 @@ class FixPath:
         inside = (self.t_ns[:-1] >= t_ns[0]) & (self.t_ns[1:] <= t_ns[-1])
         step = np.diff(np.interp(self.t_ns, t_ns, travel))[inside]
         length, travelled = self.length[inside], np.abs(step)
-        moved = (travelled > MIN_NUMBER) & (length > length.mean()) if len(length) else inside[:0]
-        if len(length) < MIN_STEPS or not moved.any() or not np.isfinite(travelled).all():
+        if len(length) < MIN_STEPS or not np.isfinite(travelled).all():
+            return NO_MATCH
+        moved = (travelled > MIN_NUMBER) & (length > length.mean())
+        if not moved.any():
             return NO_MATCH
         error = np.abs(length - np.median(length[moved] / travelled[moved]) * travelled)
-        outliers = 0.05      # share of cells with a reset of a counter or a jump of the fixes
-        kept = error <= np.quantile(error, 1 - outliers)
+        outlier_share = 0.05      # of cells: resets of a counter, jumps of the fixes
+        kept = error <= np.quantile(error, 1 - outlier_share)
         length, travelled, step = length[kept], travelled[kept], step[kept]
         if not travelled.any() or not np.ptp(length):
             return NO_MATCH
@@ -205,13 +214,13 @@ class FixPath:
 
 def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     """Return the path of the usable fixes by arrival time; None if it is too short."""
-    use, covariance_n, _ = usable_fixes(rows, len(rows.stamp_ns), gnss)
-    use &= np.append(True, np.diff(rows.received_ns) > 0)
-    if use.sum() < MIN_STEPS:
+    usable, covariance_n, _ = usable_fixes(rows, len(rows.stamp_ns), gnss)
+    usable &= np.append(True, np.diff(rows.received_ns) > 0)
+    if usable.sum() < MIN_STEPS:
         return None
-    t_ns = rows.received_ns[use]
+    t_ns = rows.received_ns[usable]
     t = (t_ns - t_ns[0]) * 1e-9
-    geodetic = np.stack([rows.latitude, rows.longitude, np.nan_to_num(rows.height)], -1)[use]
+    geodetic = np.stack([rows.latitude, rows.longitude, np.nan_to_num(rows.height)], -1)[usable]
     fixes_n = median_origin(t, geodetic).to_n(geodetic)
     reachable = find_reachable(t, fixes_n)
     t, t_ns, fixes_n = t[reachable], t_ns[reachable], fixes_n[reachable, :2]
@@ -220,11 +229,13 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
         return None
     # duration of a cell, s: its mean path length is ten times the fix noise or more, so that the
     # noise of both ends is below 15 % of it
-    shortest, noise_ratio = 4.0, 10.0
-    cell = max(shortest, noise_ratio * fix_white_noise(fixes_n) * (t[-1] - t[0]) / path_length)
-    knots = np.unique(np.searchsorted(t[:-1], np.arange(t[0], t[-1], cell)))
-    return FixPath(t_ns[knots], np.hypot(*np.diff(fixes_n[knots], axis=0).T),
-                   float(np.sqrt(np.median(covariance_n[use][:, 0, 0]))))
+    min_duration, noise_ratio = 4.0, 10.0
+    duration = max(min_duration,
+                   noise_ratio * fix_white_noise(fixes_n) * (t[-1] - t[0]) / path_length)
+    # first fix of each cell
+    edges = np.unique(np.searchsorted(t[:-1], np.arange(t[0], t[-1], duration)))
+    return FixPath(t_ns[edges], np.hypot(*np.diff(fixes_n[edges], axis=0).T),
+                   float(np.sqrt(np.median(covariance_n[usable][:, 0, 0]))))
 
 
 def stops_and_speeds(inputs: Inputs, scale: float, config: Config) -> tuple[Floats, list[float]]:
@@ -239,18 +250,19 @@ def stops_and_speeds(inputs: Inputs, scale: float, config: Config) -> tuple[Floa
 
 
 def straight_sections(inputs: Inputs, located: LocatedFixes,
-                      shortest: float) -> list[tuple[float, float]]:
-    """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
+                      min_length: float) -> list[tuple[float, float]]:
+    """Return (start, stop), s, of straight sections of ``min_length`` m or more, longest first."""
     if not located.rough_scale or len(inputs.t_fix) < 3:
         return []
     max_fixes = 600    # fixes tested for straight sections, evenly selected
     selected = np.unique(np.linspace(0, len(inputs.t_fix) - 1, max_fixes).astype(int))
     t, position = inputs.t_fix[selected], located.fixes_n[selected, :2]
+    # between each two fixes
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(position[None] - position[:, None]).transpose(2, 0, 1))
-    is_long = chord >= shortest
-    # the rough scale is too small with curves, where chords are shorter than the path: the
-    # straightest sections determine it best
+    is_long = chord >= min_length
+    # chords are shorter than the path in curves, which reduces the rough scale: the straightest
+    # sections determine it best
     ratio = chord[is_long] / np.maximum(travel[is_long], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
     path_length = travel * max(located.rough_scale, min(best, 1.2 * located.rough_scale))
@@ -258,7 +270,7 @@ def straight_sections(inputs: Inputs, located: LocatedFixes,
     straight = 0.97
     # both end points have errors of sigma: a section within these errors is accepted
     suitable = np.triu((chord >= straight * path_length - located.fix_sigma)
-                       & (path_length >= shortest)
+                       & (path_length >= min_length)
                        & (chord <= path_length / straight + 4 * located.fix_sigma))
     sections: list[tuple[float, float]] = []
     while suitable.any():
