@@ -199,7 +199,7 @@ def test_the_page_lists_the_figures_of_the_report():
     listed = re.findall(r'^\| ([A-Z][\w ]+) \|', table, re.MULTILINE)
     source = ''.join((ROOT / 'odocal_ros' / 'output' / name).read_text()
                      for name in ('plots.py', 'scale_plots.py'))
-    drawn = re.findall(r"return '([^']+)', text", source)
+    drawn = re.findall(r"style\.drawing\(figure, f'[^']+', '([^']+)'", source)
     assert listed == drawn
     assert 'Origin' in (ROOT / 'odocal_ros/output/templates/report.html').read_text()
 

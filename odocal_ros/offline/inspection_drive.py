@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The drive in a bag, for odocal inspect: what IMU, odometer and fixes show only together."""
+"""
+The drive in a bag, for odocal inspect: findings that need IMU, odometer and fixes together.
+
+They are the mounting of the IMU, units, the legs that replay would use, and other possible legs.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -34,16 +38,16 @@ from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen_aligned
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
-from odocal_ros.settings.nominal import nominal_scale
+from odocal_ros.settings.nominal import G, nominal_scale
 
-# judgement: of the path length; no vehicle drives a larger net share of a recording backwards.
-# With a counter that counts down, the IMU would seem to be mounted backwards
+# judgement: net share of the path length that a vehicle drives backwards in a recording. If it
+# seems to be larger, the counter decreases, and the IMU would seem to be mounted backwards
 MAX_BACKWARD_SHARE = 0.5
 
 
 @dataclass
 class DriveInspection:
-    """What IMU, odometer and fixes show together; what cannot be computed is empty."""
+    """Content of a drive; entries that cannot be computed are empty."""
 
     # entries of ``inspection.inspect``
     content: dict[str, Any] = field(default_factory=lambda: {
@@ -59,8 +63,8 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config) -> DriveInspe
     if not all(len(recorder.rows(slot).stamp_ns) for slot in ('imu', 'odometer')):
         return result
     try:
-        (first, last), = find_legs(recorder, bag, [LegSpan(None, None)], [], config)      # ns
-        leg = recorder.close(first, last, preroll=0.0)
+        (first_ns, last_ns), = find_legs(recorder, bag, [LegSpan(None, None)], [], config)
+        leg = recorder.close(first_ns, last_ns, preroll=0.0)
     except (BadData, BadUsage) as error:
         result.findings.append(Reason(Code.CLOCKS_DIFFER, str(error), SYNCHRONISE_REMEDY))
         return result
@@ -69,9 +73,9 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config) -> DriveInspe
     result.findings += [reason for reason in reasons if reason.code is not Code.NO_FIX or len(
         recorder.rows('fix').stamp_ns)]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
-        known = {reason.code for reason in result.findings}
+        codes = {reason.code for reason in result.findings}
         result.findings += [reason for reason in missing_data_reasons(leg, inputs)
-                            if reason.code not in known]
+                            if reason.code not in codes]
         return result
     result.findings += _imu_unit_reasons(inputs, config)
     result.options, w_i, f_i = _unit_options(inputs, config)
@@ -79,7 +83,7 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config) -> DriveInspe
     still_reasons = [reason for reason in motion_reasons(
         inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.t_stop,
         inputs.min_motion) if reason.code is Code.ODOMETER_STILL]
-    if still_reasons:       # scale, speeds, standstills and axes are computed from the counts
+    if still_reasons:       # without travel there are no scale, speeds, standstills and axes
         result.findings += still_reasons
         return result
     standstills, speeds = survey.stops_and_speeds(inputs, located.rough_scale, config)
@@ -97,21 +101,22 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config) -> DriveInspe
     if mounting['needed'] and not axis_faults:
         rpy = ', '.join(f'{angle:.10g}' for angle in mounting['rpy'])
         result.options.append(f'imu.mounting_rpy=[{rpy}]')
-    legs, leg_options = _describe_legs(bag, recorder, inputs, located, standstills, first, config)
+    legs, leg_options = _describe_legs(bag, recorder, inputs, located, standstills, first_ns,
+                                       config)
     result.options += [*_sigma_limit(recorder, config), *leg_options]
-    base = (first - bag.start_ns) * 1e-9      # s: times of the leg start at its first sample
+    offset = (first_ns - bag.start_ns) * 1e-9      # s: times of a leg start at its first sample
     result.content |= {'drive': drive, 'mounting': mounting, **legs, 'standstills': [
-        [base + begin, base + end] for begin, end in standstills.tolist()]}
+        [offset + begin, offset + end] for begin, end in standstills.tolist()]}
     return result
 
 
 def _drive_facts(inputs: Inputs, located: LocatedFixes, speeds: list[float]) -> dict[str, Any]:
-    """Return path length, scale and speeds; speeds: lowest, highest, m/s by the rough scale."""
+    """Return path length, scale and speeds; speeds: lowest and highest by the rough scale, m/s."""
     path_length, chord = path_and_chord(inputs.t_fix, located.fixes_n, inputs.min_motion)
     travel = _travel_between_fixes(inputs)
     is_long = path_length > 2.5 * inputs.min_motion      # judgement: then it is accurate to 1 %
     scale = path_length / travel if is_long and travel else located.rough_scale or None
-    # speeds with the printed scale
+    # the speeds are multiplied by it, so that they belong to this scale
     scale_ratio = scale / located.rough_scale if scale and located.rough_scale else 1.0
     return {'distance': path_length, 'chord': chord, 'fix_sigma': located.fix_sigma,
             'rough_scale': scale, 'scale_unit': inputs.scale_unit,
@@ -120,7 +125,7 @@ def _drive_facts(inputs: Inputs, located: LocatedFixes, speeds: list[float]) -> 
 
 
 def _travel_between_fixes(inputs: Inputs) -> float:
-    """Return the travel between the first and the last fix (else all), in odometer units."""
+    """Return the travel, odometer units, between the first and last fix; all without two fixes."""
     t, s = inputs.travel.t, inputs.travel.s
     if len(inputs.t_fix) > 1:
         ends = inputs.t_fix[[0, -1]]
@@ -138,13 +143,13 @@ def _imu_unit_reasons(inputs: Inputs, config: Config) -> list[Reason]:
 
 
 def _unit_options(inputs: Inputs, config: Config) -> tuple[list[str], Floats, Floats]:
-    """Return the settings for the units of the IMU, rates in rad/s and forces, frame i."""
+    """Return the settings for the units of the IMU; turn rates, rad/s, and forces, (n, 3) in i."""
     w_i, f_i = inputs.w_b, inputs.f_b
     if not np.array_equal(inputs.C_bi, np.eye(3)):
         w_i, f_i = w_i @ inputs.C_bi, f_i @ inputs.C_bi
     options = []
     if 0.85 < np.linalg.norm(medians(f_i)) < 1.15:      # in g
-        options.append(f'imu.accel_scale={9.80665 * config.imu.accel_scale:.10g}')
+        options.append(f'imu.accel_scale={G * config.imu.accel_scale:.10g}')
     if np.percentile(lengths(w_i - medians(w_i)), 99.9) > imu_orientation.MAX_RATE:
         options.append(f'imu.gyro_scale={RAD_PER_DEG * config.imu.gyro_scale!r}')
         w_i = w_i * RAD_PER_DEG
@@ -152,7 +157,7 @@ def _unit_options(inputs: Inputs, config: Config) -> tuple[list[str], Floats, Fl
 
 
 def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
-    """Return the default of gnss.max_sigma as an option if the limit drops most of the fixes."""
+    """Return the option that removes gnss.max_sigma if this limit drops most of the fixes."""
     rows = recorder.rows('fix')
     all_count, kept = (int(usable_fixes(rows, 0, replace(config.gnss, max_sigma=limit))[0].sum())
                        for limit in (0.0, config.gnss.max_sigma))
@@ -161,7 +166,7 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
 
 def _mounting_facts(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Floats,
                     config: Config) -> tuple[dict[str, Any], Travel]:
-    """Return the orientation of the IMU, and the travel, reversed if it decreases on the whole."""
+    """Return facts on the orientation of the IMU, and the travel, negated if it decreases."""
     is_configured = bool(np.any(config.imu.mounting_rpy))
     travel, step = inputs.travel, np.diff(inputs.travel.s)
     if not is_configured and step.sum() < -MAX_BACKWARD_SHARE * np.abs(step).sum():
@@ -182,7 +187,7 @@ def _mounting_facts(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_i: Flo
 
 def _check_gyro(inputs: Inputs, located: LocatedFixes, w_i: Floats,
                 config: Config) -> tuple[float | None, Sequence[Reason]]:
-    """Return turns of the gyro over turns of the course, None if unknown, and faults of axes."""
+    """Return the ratio of gyro turns to course turns, None if unknown; reasons for wrong axes."""
     orientation = imu_orientation.estimate_orientation(inputs, located.rough_scale) \
         if inputs.has_accelerometer and located.rough_scale else None
     return check_turns(replace(inputs, w_b=w_i @ inputs.C_bi.T), located, orientation,
@@ -190,36 +195,36 @@ def _check_gyro(inputs: Inputs, located: LocatedFixes, w_i: Floats,
 
 
 def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: LocatedFixes,
-                   standstills: Floats, first: int,
+                   standstills: Floats, first_ns: int,
                    config: Config) -> tuple[dict[str, Any], list[str]]:
     """
     Return the legs that replay would use and other possible ones, and options for better ones.
 
-    standstills : (k, 2) s.   first : stamp of t = 0, ns.
+    standstills : (k, 2) s.   first_ns : stamp of t = 0.
     """
     if not len(inputs.t_fix):
         return {}, []
-    base = (first - bag.start_ns) * 1e-9
+    offset = (first_ns - bag.start_ns) * 1e-9
 
-    def entry_of(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
-        start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
+    def leg_facts(start_ns: int, stop_ns: int) -> dict[str, Any]:
+        start, stop = (start_ns - first_ns) * 1e-9, (stop_ns - first_ns) * 1e-9
         in_leg = (inputs.t_fix >= start) & (inputs.t_fix <= stop)
         path_length, chord = path_and_chord(inputs.t_fix[in_leg], located.fixes_n[in_leg],
                                             inputs.min_motion)
-        return {'start': base + start, 'stop': base + stop, 'distance': path_length,
-                'chord': chord} | more
+        return {'start': offset + start, 'stop': offset + stop, 'distance': path_length,
+                'chord': chord}
 
     marks = marked_legs(bag)
-    stops = standstills_of(inputs, first, config)
-    legs = [entry_of(*span, marked=bool(marks))
+    stops = standstills_of(inputs, first_ns, config)
+    legs = [leg_facts(*span) | {'marked': bool(marks)}
             for span in find_legs(recorder, bag, [], marks, config, stops)]
-    each_stop = [entry_of(*span) for span in find_legs(
+    each_stop = [leg_facts(*span) for span in find_legs(
         recorder, bag, [EACH_STOP], [], config, stops)] if len(standstills) > 2 else []
-    straight = [entry_of(*(first + round(t * 1e9) for t in _from_rest(standstills, *ends)))
+    straight = [leg_facts(*(first_ns + round(t * 1e9) for t in _from_rest(standstills, *ends)))
                 for ends in survey.straight_sections(inputs, located,
                                                      config.leg.min_distance)[:5]]
     content = {'legs': legs, 'each_stop': each_stop, 'straight': straight}
-    # the other methods gain more from the whole drive than from its sections
+    # sections are suggested for the two-point method only: others use all turns and stops
     if marks or config.method != 'two_point' or not all(map(is_closed, legs)):
         return content, []
     open_legs = [leg for leg in each_stop
@@ -230,12 +235,12 @@ def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: Loc
 
 
 def is_closed(leg: dict[str, Any]) -> bool:
-    """Return True if a leg ends where it starts: ratio of chord to path length."""
+    """Return True if a leg ends near its start: the limit is a share of the path length."""
     return bool(leg['chord'] < MIN_CHORD_SHARE * leg['distance'])
 
 
 def _from_rest(standstills: Floats, start: float, stop: float) -> tuple[float, float]:
-    """Return a start and a stop, s; one inside a standstill is moved to its end, as marks are."""
+    """Return a start and a stop, s; a time in a standstill becomes the end of the standstill."""
     start, stop = (next((end for begin, end in standstills.tolist() if begin <= t <= end), t)
                    for t in (start, stop))
     return start, stop

@@ -16,7 +16,7 @@ STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
 
 
 def text(content: dict[str, Any]) -> str:
-    """Return the text for the content of a bag, the result of ``inspection.inspect``."""
+    """Return the text on the content of a bag, the result of ``inspection.inspect``."""
     roles = {topic: slot for slot, topic in content['mapping'].items()}
     blocks = [_head(content), _topics(content, roles)]
     blocks += [_details(topic, roles) for topic in content['topics']
@@ -50,24 +50,24 @@ def _topics(content: dict[str, Any], roles: dict[str, str]) -> list[str]:
 
 
 def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
-    """Return the description of one input, one statement per line."""
-    texts = [text for key, statements in STATEMENTS.items() if topic.get(key)
-             for text in statements(topic, topic[key])]
-    if topic['name'] not in roles and not any('warning:' in text for text in texts):
-        texts = texts[:2 + len(topic.get('motions', ()))]     # of a topic that is not used
-    return [one_line(topic['name']), *(line for text in texts for line in wrapped(text))]
+    """Return the name of a topic and statements on it, only the first ones if it is unused."""
+    statements = [statement for key, describe in STATEMENTS.items() if topic.get(key)
+                  for statement in describe(topic, topic[key])]
+    if topic['name'] not in roles and not any('warning:' in text for text in statements):
+        statements = statements[:2 + len(topic.get('motions', ()))]
+    return [one_line(topic['name']), *(line for text in statements for line in wrapped(text))]
 
 
 def _field_statements(topic: dict[str, Any], fields: dict[str, Any]) -> Iterator[str]:
     """Return a statement for each field of an unknown type that follows the path of the fixes."""
     for field in fields['found']:
         unit = 'm/count' if field['is_integer'] and field['quantity'] != 'rate' else 'm per unit'
-        grows = (f'is proportional to the speed, {field["scale"]:.3g} m/s per unit'
-                 if field['quantity'] == 'rate' else f'grows with distance, '
-                 f'{field["scale"]:.3g} {unit}' + ' (counts since the previous message)' * (
-                     field['quantity'] == 'increment'))
+        relation = {'rate': f'is proportional to the speed, {field["scale"]:.3g} m/s per unit',
+                    'cumulative': f'grows with distance, {field["scale"]:.3g} {unit}',
+                    'increment': f'grows with distance, {field["scale"]:.3g} {unit} (counts since '
+                                 'the previous message)'}[field['quantity']]
         options = [word for setting in field['settings'] for word in ('--set', setting)]
-        yield f'{topic["name"]}.{field["path"]} {grows}: {for_shell(options)}'
+        yield f'{topic["name"]}.{field["path"]} {relation}: {for_shell(options)}'
     if not fields['found']:
         yield (f'no numeric field grows with the distance between the fixes ({fields["tried"]} '
                'tried)')
@@ -78,41 +78,43 @@ def _imu_statements(_topic: dict[str, Any], imu: dict[str, Any]) -> Iterator[str
     if not imu['gravity']:
         yield 'no specific force: no accelerometer, or its data is not published'
     else:
-        mounted = {'+z': 'z-up', '-z': 'looks z-down'}.get(
-            imu['gravity_axis'], 'mounted on its side')
-        yield (f'gravity {imu["gravity"]:.3f} {"" if unit == "unknown" else unit} on '
-               f'{imu["gravity_axis"]} ({math.degrees(imu["tilt_from_axis"]):.1f} deg off): '
-               f'{mounted}')
+        orientation = {'+z': 'the IMU z axis points up', '-z': 'the IMU z axis points down'}.get(
+            imu['gravity_axis'], 'the IMU is mounted on its side')
+        yield (f'specific force {imu["gravity"]:.3f} {"" if unit == "unknown" else unit} along '
+               f'{imu["gravity_axis"]} (within {math.degrees(imu["tilt_from_axis"]):.1f} deg): '
+               f'{orientation}')
         if unit != 'm/s^2':
             yield 'warning: specific force is not in m/s^2' + ' but in g' * (unit == 'g')
         if imu['not_finite']:
-            yield f'warning: {imu["not_finite"]} messages hold NaN or Inf'
+            yield f'warning: {counted(imu["not_finite"], "message")} with NaN or Inf'
     if not imu['orientation']:
         yield 'no orientation' + (
-            ' (covariance -1)' if imu['orientation_refused'] > 0.5 else ' (never set)')
+            ' (covariance -1)' if imu['orientation_refused'] > 0.5 else ' (always the identity)')
     elif imu['yaw_sigma'] is None:
-        yield 'has an orientation, covariance unknown'
+        yield 'the IMU publishes an orientation of unknown covariance'
     else:
-        yield f'has an orientation, yaw sigma {math.degrees(imu["yaw_sigma"]):.2f} deg'
+        yield ('the IMU publishes an orientation, stated yaw sigma '
+               f'{math.degrees(imu["yaw_sigma"]):.2f} deg')
 
 
 def _odometer_statements(_topic: dict[str, Any], odometer: dict[str, Any]) -> Iterator[str]:
     is_angle = odometer['scale_unit'] == 'm/rad'
-    what = {'cumulative': 'running angle' if is_angle else 'running count', 'rate': 'speed',
-            'increment': 'counts since the previous message'}[odometer['quantity']]
+    quantity = {'cumulative': 'running angle' if is_angle else 'running count', 'rate': 'speed',
+                'increment': 'counts since the previous message'}[odometer['quantity']]
     unit = {'m/pulse': 'pulses', 'm/rad': 'rad', '1': 'm'}[odometer['scale_unit']]
     unit += '/s' * (odometer['quantity'] == 'rate')
     if odometer['minimum'] is None:
         yield 'warning: no valid value'
         return
     if odometer['quantity'] == 'rate' and odometer.get('not_following'):
-        what = 'one component of a velocity, not the speed along the path of the fixes'
-    form = '.5g' if odometer['quantity'] == 'rate' else '.6g' if is_angle else '.12g'
-    yield f'{what}: {odometer["minimum"]:{form}} to {odometer["maximum"]:{form}} {unit}'
+        quantity = 'one component of a velocity, not the speed along the path of the fixes'
+    digits = 5 if odometer['quantity'] == 'rate' else 6 if is_angle else 12
+    minimum, maximum = (f'{odometer[key]:.{digits}g}' for key in ('minimum', 'maximum'))
+    yield f'{quantity}: {minimum} to {maximum} {unit}'
     if odometer['meaning']:
-        yield f'follows the fixes as a {what} only: --set {odometer["meaning"]}'
+        yield f'its values follow the fixes only as a {quantity}: --set {odometer["meaning"]}'
     if odometer['not_finite']:
-        yield f'warning: {odometer["not_finite"]} messages hold NaN or Inf'
+        yield f'warning: {counted(odometer["not_finite"], "message")} with NaN or Inf'
 
 
 def _fix_statements(topic: dict[str, Any], fix: dict[str, Any]) -> Iterator[str]:
@@ -121,14 +123,14 @@ def _fix_statements(topic: dict[str, Any], fix: dict[str, Any]) -> Iterator[str]
     if fix['sigma']:
         median, least, most = (f'{fix["sigma"][key]:.2f}'
                                for key in ('median', 'minimum', 'maximum'))
-        sigma = f'sigma {median} m' + f' ({least} to {most})' * (least != most)
+        sigma = f'stated sigma {median} m' + f' ({least} to {most})' * (least != most)
+        if fix['covariance_known'] < topic['count']:
+            sigma += f', covariance in {fix["covariance_known"]} of {topic["count"]}'
     else:
         sigma = 'no covariance'
-    partly = f', covariance in {fix["covariance_known"]} of {topic["count"]}' \
-        if fix['sigma'] and fix['covariance_known'] < topic['count'] else ''
-    yield f'status: {status}; {sigma}{partly}'
-    if fix['positions'] < topic['count']:
-        yield f'warning: {topic["count"] - fix["positions"]} of them without a position'
+    yield f'status: {status}; {sigma}'
+    if without_position := topic['count'] - fix['positions']:
+        yield f'warning: {counted(without_position, "message")} without a position'
     if fix['position_step'] and fix['position_step'] > 0.05:
         yield f'position resolution {fix["position_step"]:.2f} m'
 
@@ -139,21 +141,21 @@ def _timing_statements(topic: dict[str, Any], timing: dict[str, Any]) -> Iterato
         yield 'no header: arrival time (bag time) is used as stamp' + (
             '' if jitter is None else f'; arrival jitter {1e3 * jitter:.1f} ms')
     elif abs(delay := timing['header_to_bag'] or 0.0) > 0.5e-3:     # None: no row has a stamp
-        where = 'after' if delay > 0 else 'before'
-        yield (f'messages are recorded {abs(delay):.3f} s {where} the time in their header '
+        order = 'after' if delay > 0 else 'before'
+        yield (f'messages are recorded {abs(delay):.3f} s {order} the time in their header '
                f'(1 sigma: {timing["header_to_bag_spread"]:.3f} s)')
     if timing['whole_seconds']:
         yield ('warning: all stamps are whole seconds, without the fraction: correct the driver, '
                'or use arrival times (such as odometer.arrival_time)')
-    stamp_faults = [f'{timing[key]} {what}' for key, what in (
+    stamp_faults = [f'{timing[key]} {fault}' for key, fault in (
         ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the previous stamp'),
         ('backward_steps', 'with a stamp before the previous one')) if timing[key]]
     if stamp_faults:
         yield f'warning: of {topic["count"]} messages, {", ".join(stamp_faults)}'
     if timing['gap_count']:
         longest = max(timing['gaps'], key=lambda gap: gap['length'])
-        yield (f'warning: {counted(timing["gap_count"], "gap")}, the '
-               f'longest {longest["length"]:.2f} s at {longest["at"]:.2f} s')
+        yield (f'warning: {counted(timing["gap_count"], "gap")}, the longest of '
+               f'{longest["length"]:.2f} s at t = {longest["at"]:.2f} s')
 
 
 # key of a topic's facts: function of the topic and of these facts that yields statements on them
@@ -176,8 +178,9 @@ def _drive(content: dict[str, Any]) -> list[str]:
     if drive['rough_scale'] and drive['scale_unit'] != '1':
         lines.append(f'  scale factor about {drive["rough_scale"]:.4g} {drive["scale_unit"]}')
     stops = content['standstills']
-    shown = ', '.join(f'{a:.1f} to {b:.1f}' for a, b in stops[:8]) + ', ...' * (len(stops) > 8)
-    lines += wrapped(f'standstills: {shown} s' if stops else 'standstills: none')
+    times = ', '.join(f'{begin:.1f} to {end:.1f}' for begin, end in stops[:8])
+    lines += wrapped(f'standstills: {times}{", ..." * (len(stops) > 8)} s' if stops
+                     else 'standstills: none')
     lines += _legs(content['legs'])
     if len(content['each_stop']) > 1:
         lines.append(f'  --leg each-stop: {len(content["each_stop"])} legs, '
@@ -206,7 +209,7 @@ def _leg(leg: dict[str, Any]) -> str:
 
 
 def _mounting(mounting: dict[str, Any]) -> list[str]:
-    """Return the orientation of the IMU in the vehicle, and how it is known."""
+    """Return the orientation of the IMU in the vehicle, and the data that determine it."""
     if not mounting['accelerometer']:
         return wrapped('axes: an upright IMU is assumed, as there is no accelerometer; if it is '
                         'not upright, set imu.mounting_rpy')
@@ -219,11 +222,11 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
     else:
         uncertainty = whole_degrees(mounting['forward_sigma'])
         source = ('forward direction from accelerations and turns, uncertainty '
-                  f'{uncertainty} deg (1 sigma); the measured mounting differs from it by '
-                  f'{math.degrees(mounting["deviation"]):.1f} deg')
-    text = 'set imu.mounting_rpy to' if mounting['needed'] else \
+                  f'{uncertainty} deg (1 sigma); the measured mounting differs from these quarter '
+                  f'turns by {math.degrees(mounting["deviation"]):.1f} deg')
+    action = 'set imu.mounting_rpy to' if mounting['needed'] else \
         'imu.mounting_rpy is correct to the nearest quarter turn:'
-    return wrapped(f'axes: {text} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {source})')
+    return wrapped(f'axes: {action} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {source})')
 
 
 def whole_degrees(angle: float) -> str:

@@ -168,7 +168,7 @@ def test_odd_stamps_and_gaps_are_counted(inspect_drive):
     assert [longest['length'], longest['at']] == pytest.approx(
         [600 / RATE, 2000 / RATE], abs=0.05)
     assert topic(seen, '/imu/data')['rate_hz'] == pytest.approx(RATE, rel=0.01)
-    assert f'the longest {longest["length"]:.2f} s at {longest["at"]:.2f} s' in text
+    assert f'the longest of {longest["length"]:.2f} s at t = {longest["at"]:.2f} s' in text
     assert {'BAD_ROWS_DROPPED', 'STAMPS_NOT_RISING'} <= codes(seen)
 
 

@@ -45,8 +45,9 @@ def test_inspect_finds_topics_axes_and_motion_of_a_car_of_comma2k19(data_dir, ca
     assert pulses['timing']['headerless']
     assert (pulses['odometer']['quantity'], pulses['rate_hz']) == (
         'cumulative', pytest.approx(82.9, abs=0.1))
-    for line in ('looks z-down', 'no header: arrival time', 'arrival jitter', 'never at rest',
-                 'no covariance', '3 topics can be the odometer', '[3.141592654, 0, 0] rad'):
+    for line in ('the IMU z axis points down', 'no header: arrival time', 'arrival jitter',
+                 'never at rest', 'no covariance', '3 topics can be the odometer',
+                 '[3.141592654, 0, 0] rad'):
         assert line in text
 
 
