@@ -184,7 +184,7 @@ def test_the_share_of_a_slip_in_the_mean_is_one_over_the_wheels():
 def departing(**ratios):
     wheels = {name: Wheel(ratio, 1e-4, side * 0.8, 1e-3, (1e-3,))
               for (name, ratio), side in zip(ratios.items(), (1, -1) * 2, strict=True)}
-    _, reasons = wheel_estimates(wheels, wheels, Estimate(0.3, 3e-5, 'm/rad'), Config())
+    _, reasons = wheel_estimates(list(wheels), wheels, Estimate(0.3, 3e-5, 'm/rad'), Config())
     return codes(reasons).get(Code.WHEEL_DEPARTS, '')
 
 

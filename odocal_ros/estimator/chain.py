@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from odocal_ros.data.arrays import blocks, Floats, Ints, iterate_releasing, work_array
 from odocal_ros.errors import OdocalError
@@ -42,7 +43,7 @@ class Normal:
 
     def __init__(self, N: int, n: int, m: int) -> None:
         self.diagonal = work_array(N, n, n)
-        # what the elimination multiplies by H_k^-1, side by side
+        # upper, coupling and g side by side: the elimination multiplies all by H_k^-1
         self.right_sides = work_array(N, n, n + m + 1)
         self.upper = self.right_sides[:-1, :, :n]
         self.coupling = self.right_sides[:, :, n:n + m]
@@ -144,14 +145,14 @@ class JointMarginals:
         return len(self._diagonal) - 1
 
     def __getitem__(self, k: int) -> Floats:
-        """Return the covariance of one interval: (2n + m, 2n + m)."""
+        """Return the covariance of interval k: (2n + m, 2n + m)."""
         out: Floats = self.covariances(np.array([k % len(self)]))[0]
         return out
 
     def covariances(self, rows: Ints) -> Floats:
-        """Return the covariances of the intervals k of an index array: (r, 2n + m, 2n + m)."""
-        n, size = self._diagonal.shape[1], self._cross.shape[2] + self._diagonal.shape[1]
-        out = np.empty((len(rows), size, size))
+        """Return the covariances of intervals, an index array (r,): (r, 2n + m, 2n + m)."""
+        n = self._diagonal.shape[1]
+        out = np.empty((len(rows), *[n + self._cross.shape[2]] * 2))
         cross, after = self._cross[rows], self._cross[rows + 1][:, :, n:]
         out[:, :n, :n], out[:, :n, n:] = self._diagonal[rows], cross
         out[:, n:, :n] = np.swapaxes(cross, 1, 2)
@@ -162,15 +163,11 @@ class JointMarginals:
 
     def variances(self) -> Floats:
         """Return the variance of each unknown of each block: (N, n)."""
-        # copies: views would be read again after their memory is released
-        return np.concatenate([np.einsum('kii->ki', self._diagonal[rows]).copy()
-                               for rows in blocks(len(self._diagonal))])
+        return _diagonals(self._diagonal)
 
     def next_covariances(self) -> Floats:
         """Return the covariance of each unknown with itself in the next block: (N - 1, n)."""
-        n = self._diagonal.shape[1]
-        return np.concatenate([np.einsum('kii->ki', self._cross[rows, :, :n]).copy()
-                               for rows in blocks(len(self))])
+        return _diagonals(self._cross[:-1, :, :self._diagonal.shape[1]])
 
     def variances_of(self, rows: Ints, J: Floats, J_constants: Floats, J_next: Floats | None,
                      next_columns: slice) -> Floats:
@@ -215,21 +212,18 @@ class JointMarginals:
 
 def solve(normal: Normal) -> Solved:
     """Solve normal equations in place; raises NotPositive if an unknown is not constrained."""
-    from scipy.linalg.lapack import dpotrf, dpotrs
-    right_sides = normal.right_sides
-    N, n = normal.g.shape
-    m = len(normal.g_constants)
+    right_sides, (N, n), m = normal.right_sides, normal.g.shape, len(normal.g_constants)
     s, s_c = _scale(normal)
-    corner = np.zeros((m + 1, m + 1))
-    corner[:m, :m] = normal.corner * np.multiply.outer(s_c, s_c)
-    corner[:m, m] = corner[m, :m] = normal.g_constants * s_c
+    corner, s_corner = np.zeros((m + 1, m + 1)), np.multiply.outer(s_c, s_c)
+    corner[:m, :m], corner[:m, m] = normal.corner * s_corner, normal.g_constants * s_c
+    corner[m, :m] = corner[:m, m]
     roots = _eliminate(normal, corner)
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
         raise NotPositive('the data do not determine the constants of the vehicle')
     logdet = 2 * sum(np.log(x).sum() for x in (roots / s, root.diagonal() / s_c)) \
         + np.log(normal.unused_weights).sum()
-    reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
+    reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / s_corner
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
     x = np.concatenate([right_sides[rows, :, n + m] - right_sides[rows, :, n:n + m] @ c
@@ -239,7 +233,7 @@ def solve(normal: Normal) -> Solved:
     unused = normal.unused_weights
     return Solved(
         x * s, _with_unused(c * s_c, 0 * unused),
-        _with_unused(covariance * np.multiply.outer(s_c, s_c), 1 / unused), float(logdet),
+        _with_unused(covariance * s_corner, 1 / unused), float(logdet),
         _with_unused(reduced, unused), _with_unused(corner[:m, m] / s_c, 0 * unused),
         (right_sides, normal.diagonal), s, s_c)
 
@@ -262,8 +256,11 @@ def _scale(normal: Normal) -> tuple[Floats, Floats]:
 
 
 def _eliminate(normal: Normal, corner: Floats) -> Floats:
-    """Eliminate the blocks and reduce the corner, in place; return diagonals of roots: (N, n)."""
-    from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+    """
+    Eliminate the blocks, in place; return the diagonals of their Cholesky factors: (N, n).
+
+    corner : (m + 1, m + 1), reduced; the last row and column are those of the right-hand side.
+    """
     diagonal, right_sides = normal.diagonal, normal.right_sides
     N, n = normal.g.shape
     D, roots = diagonal[0], np.empty((N, n))
@@ -276,15 +273,22 @@ def _eliminate(normal: Normal, corner: Floats) -> Floats:
         roots[k] = root.diagonal()
         corner -= W[:, n:].T @ X[:, n:]
         if k + 1 < N:
-            onward = W[:, :n].T @ X
-            D = diagonal[k + 1] - onward[:, :n]
-            right_sides[k + 1, :, n:] -= onward[:, n:]
+            fill_in = W[:, :n].T @ X
+            D = diagonal[k + 1] - fill_in[:, :n]
+            right_sides[k + 1, :, n:] -= fill_in[:, n:]
         diagonal[k] = dpotri(root, lower=1)[0]
         W[:] = X
     below = np.tril_indices(n, -1)      # dpotri fills one triangle
     for rows in blocks(N):
         diagonal[rows, below[1], below[0]] = diagonal[rows, below[0], below[1]]
     return roots
+
+
+def _diagonals(matrices: Floats) -> Floats:
+    """Return the diagonals of matrices (k, n, n): (k, n)."""
+    # copies: views would be read again after their memory is released
+    return np.concatenate([np.einsum('kii->ki', matrices[rows]).copy()
+                           for rows in blocks(len(matrices))])
 
 
 def _with_unused(x: Floats, unused: Floats) -> Floats:

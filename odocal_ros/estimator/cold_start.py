@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Cold start: the first state of a fit, from samples alone.
+Cold start: the first state of a fit (tilt, gyro bias, scale, heading, yaw mounting) from samples.
 
-Estimated are tilt, gyro bias, scale, heading and yaw mounting. The frame L is level, with the
-heading of the IMU at the first keyframe; n has east and north. Horizontal vectors are complex,
-x + i y or east + i north: a factor exp(i a) rotates by a.
+The frame L is level, with the heading of the IMU at the first keyframe. Horizontal vectors are
+complex, x + i y in L or east + i north in n: a factor exp(i a) rotates by the angle a.
 
 The gyro gives the attitude relative to the first keyframe. The mean specific force of the drive is
 up; its apparent rotation is the gyro bias about the horizontal axes. The fit of the odometer's
@@ -43,10 +42,10 @@ class FittedTrack:
     """
     The track of the odometer, with the x axis of b as forward axis, fitted to the fixes.
 
-    X : (N,) scale units, complex, in L.   K : metres per unit.   chi : rad, rotation from X to the
-    fixes at the first keyframe.   slope : rad/s, its change with time, None without fixes.
-    chi_t : (N,) rad, at the keyframes.   position : (N,) m, complex, in n.   height : (N,) m.
-    scatter : m, of the fixes about the track.
+    X : (N,) track, scale units, complex, in L.   K : metres per unit.   chi : rad, rotation from X
+    to the fixes at the first keyframe.   slope : rad/s, change of chi with time, None without
+    fixes.   chi_t : (N,) rad, chi at the keyframes.   position : (N,) m, complex, in n.
+    height : (N,) m.   scatter : m, of the fixes about the track.
     """
 
     def __init__(self, leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals) -> None:
@@ -66,7 +65,7 @@ class FittedTrack:
         """Fit K, chi and its slope; z, X : (m,) fixes, m, and track at their times."""
         sigma = float(np.sqrt(np.median(leg.covariance_n[:, 0, 0])))
         self.K, self.slope = leg.rough_scale, None
-        # weighted by length of the odometer: a jump of the fixes does not get a larger weight
+        # weighted by the odometer path, not by that of the fixes, which may jump
         track_step, fix_step = np.diff(X), np.diff(z)
         self.chi = float(np.angle((
             track_step.conj() * fix_step / np.maximum(np.abs(fix_step), sigma)).sum()))
@@ -82,8 +81,9 @@ class FittedTrack:
             if len(rotation) > 1:
                 rotation = np.unwrap(mean + wrap(rotation - mean))
             self.chi, self.slope = fit_robust_line(sections.t, rotation)
-            rows = np.interp(sections.t, t_fix, np.arange(len(t_fix)))
-            k = np.unique(np.round(rows).astype(int))
+            # scale: median ratio of the chords between the fixes nearest to the section times
+            nearest = np.interp(sections.t, t_fix, np.arange(len(t_fix)))
+            k = np.unique(np.round(nearest).astype(int))
             path, chord = np.abs(np.diff(X[k])), np.abs(np.diff(z[k]))
             if (path > 0).any():
                 self.K = float(np.median(chord[path > 0] / path[path > 0]))
@@ -103,20 +103,20 @@ def _window_medians(t: Floats, t_fix: Floats, y: Floats) -> Floats:
         return np.zeros(len(t))
     window = np.floor((t_fix - t_fix[0]) / 20.0).astype(int)
     masks = [window == k for k in np.unique(window)]
-    at, medians = ([np.median(x[mask]) for mask in masks] for x in (t_fix, y))
-    return np.asarray(np.interp(t, at, medians))
+    t_medians, medians = ([np.median(x[mask]) for mask in masks] for x in (t_fix, y))
+    return np.asarray(np.interp(t, t_medians, medians))
 
 
 @dataclass(frozen=True, eq=False)
 class _Section:
-    """A section of a leg."""
+    """The estimates in a section of a leg."""
 
-    t: Floats           # (n,) s, of its keyframes
-    C_Lk: Floats        # (n, 3, 3) attitudes, from b to its frame L
-    bias: Floats        # (3,) rad/s, of the gyro
+    t: Floats           # (n,) s, times of its keyframes
+    C_Lk: Floats        # (n, 3, 3) attitudes, from b to the frame L of the section
+    gyro_bias: Floats   # (3,) rad/s
     track: FittedTrack
-    psi: float          # rad, rotation from L to n, by accelerations
-    sigma: float        # rad, of psi
+    psi: float          # rad, rotation from L to n, from accelerations
+    psi_sigma: float    # rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ class Start:
     """A first state and its uncertainty."""
 
     state: State
-    yaw_sigma: float        # rad, of the heading by accelerations
+    yaw_sigma: float        # rad, of the heading from accelerations
     fix_scatter: float      # m, scatter of the fixes about the track
 
 
@@ -133,13 +133,13 @@ def cold_starts(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
     """
     Return the first state of a leg, or two if accelerations give an ambiguous heading.
 
-    priors : of the gyro bias.   configured_yaw : rad, yaw mounting of the second state, or of the
-    only one without an accelerometer.
+    priors : with the sigma of the gyro bias.   configured_yaw : rad, yaw mounting of the second
+    state, or of the only state without an accelerometer.
     """
     sections = _estimate_sections(leg, imu, priors)
     paths = [np.abs(np.diff(section.track.X)).sum() + 1e-9 for section in sections]
     K = float(np.average([section.track.K for section in sections], weights=paths))
-    weight = np.array([1 / section.sigma**2 for section in sections])
+    weight = np.array([1 / section.psi_sigma**2 for section in sections])
     sigma = float(1 / np.sqrt(weight.sum())) if weight.any() else np.inf
     yaws = [configured_yaw]
     if leg.has_accelerometer:
@@ -153,35 +153,36 @@ def cold_starts(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
 
 def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Section]:
     """Return the sections of a leg, each of about SECTION_LENGTH or longer."""
-    # one without enough fixes for a heading is joined with the next, the last with the one before
+    # a section with too few fixes for a heading is joined with the next one, the last section with
+    # the one before it
     count = max(1, round(float(np.ptp(imu.t_keyframes)) / SECTION_LENGTH))
     ends = np.linspace(0, len(imu.keyframes) - 1, count + 1).astype(int).tolist()
-    sections, firsts = list[_Section](), [0]
+    sections, starts = list[_Section](), [0]      # indices of the first keyframes
 
-    def section_of(first: int, last: int) -> _Section:
-        before = sections[-1].bias if sections else np.zeros(3)
+    def estimate(first: int, last: int) -> _Section:
         part = replace(imu, keyframes=imu.keyframes[first:last + 1])
-        return _estimate_section(leg, part, priors, before)
+        previous_bias = sections[-1].gyro_bias if sections else np.zeros(3)
+        return _estimate_section(leg, part, priors, previous_bias)
 
     for last in ends[1:]:
-        begin, end = imu.t_keyframes[[firsts[-1], last]]
+        begin, end = imu.t_keyframes[[starts[-1], last]]
         if np.count_nonzero((leg.t_fix >= begin) & (leg.t_fix <= end)) < 2:
             continue
-        section = section_of(firsts[-1], last)
+        section = estimate(starts[-1], last)
         if section.track.slope is not None:
             sections.append(section)
-            firsts.append(last)
-    if firsts[-1] < ends[-1]:
-        first = firsts[-2] if sections else 0
-        sections[-1:] = [section_of(first, ends[-1])]
+            starts.append(last)
+    if starts[-1] < ends[-1]:
+        sections[-1:] = [estimate(starts[-2] if sections else 0, ends[-1])]
     return sections
 
 
-def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _Section:
-    """Return a section; before : (3,) gyro bias of the section before it."""
+def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
+                      previous_bias: Floats) -> _Section:
+    """Return a section; previous_bias : (3,) rad/s, gyro bias of the section before it."""
     bias_at_rest = gyro_bias_at_rest(leg, imu)
     if bias_at_rest is None:
-        bias, sigma = before, np.maximum(priors.gyro_bias_sigma, 1e-3)
+        bias, sigma = previous_bias, np.maximum(priors.gyro_bias_sigma, 1e-3)
     else:       # rad/s, judgement: the drift of a consumer gyro in a leg
         bias, sigma = bias_at_rest, np.full(3, 2e-4)
     count, change = len(imu.keyframes) - 1, np.zeros(3)
@@ -225,7 +226,7 @@ def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     """Return up in the frame of the first keyframe and the change of the gyro bias: (3,) each."""
     C, T = C_0k[:-1], sums.T
     force = np.einsum('kij,kj->ki', C, sums.dv) / T[:, None]
-    # rotation by a bias of one rad/s, at mid interval
+    # rotation by a gyro bias of one rad/s up to the middle of each interval, s
     rotation = np.cumsum(C @ sums.A, axis=0) - C @ sums.A / 2
     g = gravity(leg.origin.latitude, leg.origin.height)
     up = np.median(force, axis=0)
@@ -233,7 +234,7 @@ def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     car_acceleration = 1.0      # m/s^2, 1 sigma over 1 s: physical
     weight = np.sqrt(T) / car_acceleration
     change = np.zeros(3)
-    for _ in range(3):
+    for _ in range(3):      # Gauss-Newton: residual r, derivatives J by up and the bias
         J = np.concatenate([np.broadcast_to(np.eye(3) * g, (len(T), 3, 3)),
                             -g * skew(up) @ rotation], axis=2) * weight[:, None, None]
         r = (force - g * up) * weight[:, None]
@@ -247,7 +248,7 @@ def _find_level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
 
 def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
                   track: FittedTrack) -> tuple[float, float]:
-    """Return the rotation from L to n by accelerations, rad, and its sigma."""
+    """Return the rotation from L to n, from accelerations, and its sigma: rad."""
     # least squares: change of velocity along the track = x_0 times the integral of the specific
     # force in L, plus a tilt (constant in L) and an accelerometer bias (constant in b)
     direction = C_Lk[:, 0, 0] + 1j * C_Lk[:, 1, 0]
@@ -278,17 +279,16 @@ def _find_heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
 def _state(leg: SmootherLeg, section: _Section, K: float, yaw: float) -> State:
     """Return the state of a section with scale and yaw mounting of the leg."""
     t, track, N = section.t, section.track, len(section.t)
-    C_nL = np.zeros((N, 3, 3))
-    C_nL[:, 0, 0] = C_nL[:, 1, 1] = np.exp(1j * (track.chi_t + yaw)).real
-    C_nL[:, 1, 0] = np.exp(1j * (track.chi_t + yaw)).imag
-    C_nL[:, 0, 1], C_nL[:, 2, 2] = -C_nL[:, 1, 0], 1.0
+    rotation, C_nL = np.exp(1j * (track.chi_t + yaw)), np.zeros((N, 3, 3))
+    C_nL[:, 0, 0] = C_nL[:, 1, 1] = rotation.real
+    C_nL[:, 1, 0], C_nL[:, 0, 1], C_nL[:, 2, 2] = rotation.imag, -rotation.imag, 1.0
     C_nb = C_nL @ section.C_Lk
     constants = np.zeros(M)
     constants[[LN_K, YAW, PITCH]] = np.log(K), yaw, 0.0
     v_n = (C_nb @ forward_b(yaw, 0.0)) * (K * odometer_speed(leg.travel.at, t))[:, None]
     v_n[:, 2] = 0.0
     p_n = np.stack([track.position.real, track.position.imag, track.height], -1)
-    return State(t, p_n, v_n, C_nb, gyro_bias=np.tile(section.bias, (N, 1)),
+    return State(t, p_n, v_n, C_nb, gyro_bias=np.tile(section.gyro_bias, (N, 1)),
                  accel_bias=np.zeros((N, 3)), travel_error=np.zeros(N), slow_n=np.zeros((N, 3)),
                  constants=constants)
 
@@ -296,6 +296,6 @@ def _state(leg: SmootherLeg, section: _Section, K: float, yaw: float) -> State:
 def _join_sections(leg: SmootherLeg, sections: list[_Section], K: float, yaw: float) -> State:
     """Return the states of adjacent sections as one; their common keyframes appear once."""
     states = [_state(leg, section, K, yaw) for section in sections]
-    columns = [state.keyframe_arrays() for state in states]
+    arrays = [state.keyframe_arrays() for state in states]
     return replace(states[0], **{name: np.concatenate([
-        column[name][min(k, 1):] for k, column in enumerate(columns)]) for name in columns[0]})
+        x[name][min(k, 1):] for k, x in enumerate(arrays)]) for name in arrays[0]})

@@ -104,8 +104,7 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
     # passes in which outliers are updated: the residuals of earlier ones contain errors of the
     # initial state; after the last one outliers must be constant to converge
     outlier_passes = range(1 if warm_start else 3, 16)
-    # pass that estimates the effective sample size; with two starts, only for the better one
-    sample_size_pass = 3 if warm_start is None else 0 if problem.rows_per_independent else 1
+    has_sample_sizes = warm_start is not None and bool(problem.rows_per_independent)
     level_steps = LevelSteps(problem)
     progress = Progress(warm_start is not None, frozen, outlier_passes.start + 2)
     count, state = 0, state.with_mean_up()
@@ -121,7 +120,7 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
             trace(count, state, levels, weighted, solved, progress.largest_step)
         if progress.converged or count >= max_iterations:
             break
-        if count == sample_size_pass:
+        if count == outlier_passes.start and not has_sample_sizes:
             problem.rows_per_independent = find_rows_per_independent(problem, weighted)
         if not frozen:
             marginals = solved.marginals()
@@ -168,14 +167,14 @@ def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
     outliers are tested with the new levels.
     """
     rows, levels = weighted[MotionRows], weighted.levels
-    jumps = np.zeros((2, len(variance_factors), 1))
+    jumps, jump_ratio = np.zeros((2, len(variance_factors), 1)), 1.0
     if 'slow' in weighted.factors:
         jumps = weighted[SlowError].jumps(marginals)
+        jump_ratio = new_levels['slow'] / levels['slow']
     # estimated noises in sigmas, and the observable shares of their variances
     noise, observed = (np.concatenate(x, axis=1) for x in zip(
         rows.road_noise(marginals), rows.imu_noise(marginals), jumps, strict=True))
     ratios = rows.noise.variance_ratios({n: new_levels[n] / levels[n] for n in INTERVAL})
-    jump_ratio = new_levels['slow'] / levels['slow'] if 'slow' in weighted.factors else 1.0
     ratios = np.concatenate([ratios, np.full((len(ratios), 1), jump_ratio)], axis=1)
     z2 = noise**2 / np.maximum(observed, 1e-12) / ratios
     z2[observed < MIN_OBSERVED] = 0.0
@@ -187,7 +186,7 @@ def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
 
 def find_rows_per_independent(problem: Problem, weighted: Weighted) -> dict[str, float]:
     """Return rows per independent row of other sensors and of speed steps, by sensor."""
-    # at constant acceleration errors of speed steps repeat
+    # errors of speed steps repeat at constant acceleration
     return {name: rows_per_independent(rows) for name, rows in weighted.factors.items()
             if name in (*problem.external, SpeedSteps.name) and isinstance(rows, PointRows)}
 
@@ -200,8 +199,8 @@ def relax_priors(initial: Priors, current: Priors, state: State, solved: Solved,
                    np.diag(solved.covariance))
     # not relaxed: sizes of imperfections, which are levels, an offset that is within half a step,
     # and a time constant whose prior contains all receivers
-    for kept in (layout.IMPERFECTIONS, layout.SPEED_OFFSET, layout.FIX_MOTION_TIME):
-        sigma[kept] = current.sigma[kept]
+    for constants in (layout.IMPERFECTIONS, layout.SPEED_OFFSET, layout.FIX_MOTION_TIME):
+        sigma[constants] = current.sigma[constants]
     return replace(
         current, sigma=sigma,
         gyro_bias_sigma=_widen(initial.gyro_bias_sigma, current.gyro_bias_sigma,
@@ -211,10 +210,10 @@ def relax_priors(initial: Priors, current: Priors, state: State, solved: Solved,
 
 
 def _widen(initial: Floats, current: Floats, deviation: Floats, variance: Floats) -> Floats:
-    """Return sigmas; deviation : estimate minus prior mean.   variance : of the estimate."""
+    """Return prior sigmas; deviation : estimate minus prior mean.   variance : of the estimate."""
     # at most 30 times the initial one: a larger difference is a wrong setting, which is reported
-    finite = np.isfinite(initial)
-    start, sigma = np.where(finite, initial, 1.0), np.where(finite, current, 1.0)
+    has_prior = np.isfinite(initial)
+    start, sigma = np.where(has_prior, initial, 1.0), np.where(has_prior, current, 1.0)
     z2 = deviation**2 / np.maximum(sigma**2 - variance, 0.2 * sigma**2)
     wide = np.clip(sigma * np.sqrt(z2) / RELAXATION_SIGMAS, start, 30 * start)
-    return np.where(finite, wide, np.inf)
+    return np.where(has_prior, wide, np.inf)

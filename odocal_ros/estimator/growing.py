@@ -63,7 +63,7 @@ class WindowEnd(NamedTuple):
     """Estimate of a leg up to the end of a window."""
 
     estimate: RunningEstimate
-    t: float    # s, end of the window
+    t: float    # s since the start mark
 
 
 class GrowingFit:
@@ -80,8 +80,8 @@ class GrowingFit:
         self._last: FitSummary | None = None     # summary of the last fit, start of the next one
         self._rows_per_independent: dict[str, float] = {}
         self._cold_start_length = 0.0      # s, length of the window at its last cold start
-        # estimate of all finished windows; that with the window in progress, once this is long
-        # enough: it replaces the first when NEXT_WINDOW more has been driven
+        # estimate of all finished windows; estimate that includes the window in progress, once
+        # this is long enough: it becomes ``_finished`` when NEXT_WINDOW more has been driven
         self._finished: WindowEnd | None = None
         self._candidate: WindowEnd | None = None
 
@@ -158,9 +158,8 @@ def _join_windows(finished: RunningEstimate, current: RunningEstimate,
                   config: Config) -> RunningEstimate:
     """Return the running estimate of finished windows and the one in progress."""
     # the rate of the scale differs between windows, as tyres warm up from the start of a leg
-    legs = [replace(one.method, marginal=_information(one.method).with_leg_errors(
-                {CONSTANTS[SCALE_BY_TIME]: np.inf}))
-            for one in (finished, current)]
+    legs = [replace(method, marginal=_information(method).with_leg_errors(
+        {CONSTANTS[SCALE_BY_TIME]: np.inf})) for method in (finished.method, current.method)]
     joint = combine_legs(legs, [0] * len(legs), config)
     sigmas = _parameter_sigmas(joint)
     # the largest sources are those of the window in progress
@@ -168,8 +167,7 @@ def _join_windows(finished: RunningEstimate, current: RunningEstimate,
     reasons = {(r.code, r.text): r for r in (*current.method.reasons, *joint.reasons)}
     method = replace(
         current.method, estimates=current.method.estimates | joint.estimates,
-        marginal=joint.marginal,
-        reasons=tuple(reasons.values()),
+        marginal=joint.marginal, reasons=tuple(reasons.values()),
         sources=tuple(replace(s, effects=s.effects * sigma_ratio) for s in current.method.sources))
     return RunningEstimate(method, sigmas, finished.distance + current.distance,
                            finished.agility + current.agility, current.speed)
@@ -214,7 +212,7 @@ def make_imu_steps(leg: SmootherLeg, spacing: float) -> ImuSteps:
 
 def extend_warm_start(last: FitSummary, problem: Problem) -> FitSummary | None:
     """
-    Return the start from the last fit, extended to new keyframes.
+    Return the start of a fit from the last one, extended to new keyframes.
 
     None if earlier keyframes differ, or the number of used constants: a sensor started to publish.
     """
@@ -226,12 +224,13 @@ def extend_warm_start(last: FitSummary, problem: Problem) -> FitSummary | None:
     # samples of the last 3 s may have arrived late
     if n < 2 or t[n - 1] < last_t[-1] - 3.0 or last.priors.used_count != problem.priors.used_count:
         return None
-    kept = nearest[:n]
+    old = nearest[:n]
     state = replace(last.state, **{
-        name: value[kept] for name, value in last.state.keyframe_arrays().items()})
-    earlier = [last.variance_factors[first:end].mean(axis=0)
-               for first, end in zip(kept[:-1], kept[1:], strict=True)]
-    variance_factors = np.concatenate([earlier, np.ones((len(t) - n, VARIANCE_FACTOR_COUNT))])
+        name: value[old] for name, value in last.state.keyframe_arrays().items()})
+    # the last fit may have keyframes that the new one lacks: means over the joined intervals
+    old_factors = [last.variance_factors[first:end].mean(axis=0)
+                   for first, end in zip(old[:-1], old[1:], strict=True)]
+    variance_factors = np.concatenate([old_factors, np.ones((len(t) - n, VARIANCE_FACTOR_COUNT))])
     levels = problem.initial_levels.replaced(**last.levels.values)
     return FitSummary(_extend_by_dead_reckoning(state, problem) if n < len(t) else state, levels,
                      last.priors, problem.priors, variance_factors)

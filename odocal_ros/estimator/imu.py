@@ -52,7 +52,7 @@ CHI2_3_QUARTILE = 1.213     # statistical: its lower quartile
 
 
 def imu_rows(leg: SmootherLeg) -> tuple[int, Floats]:
-    """Return the index of the first used IMU sample, and the times of all used ones, s."""
+    """Return the index of the first used IMU sample, and the times of all used samples, s."""
     first = int(np.searchsorted(leg.t_imu, leg.t_begin))
     return first, leg.t_imu[first:int(np.searchsorted(leg.t_imu, leg.t_stop, side='right'))]
 
@@ -80,13 +80,13 @@ class ImuSteps:
     """
 
     turn: Floats        # (m, 3) rad, rotation vector from start to end
-    turn_mean: Floats   # (m, 3) rad, its mean over the step: half of it if the rate is constant
-    dv: Floats          # (m, 3) integral of the specific force, m/s
-    dp: Floats          # (m, 3) its integral, m
+    turn_mean: Floats   # (m, 3) rad, mean of the turn over the step: half of it at constant rate
+    dv: Floats          # (m, 3) m/s, integral of the specific force
+    dp: Floats          # (m, 3) m, integral of dv
     signals: Floats     # (m, 6) integrals of turn rate, rad, and specific force, m/s, as measured
     longest: Floats     # (m,) s, longest time between two samples
     t: Floats           # (m + 1,) s, ends of the steps
-    keyframes: Ints     # (K + 1,) their indices in t
+    keyframes: Ints     # (K + 1,) indices of the keyframes in t
 
     @property
     def t_keyframes(self) -> Floats:
@@ -111,15 +111,13 @@ class ImuSteps:
             parts.append(_summed(leg, edges[first:last + 1]))
             first = last
             release_mapped_memory()
-        turn, turn_mean, dv, dp, signals, longest = (
-            np.concatenate(x) for x in zip(*parts, strict=True))
-        return cls(turn, turn_mean, dv, dp, signals, longest, leg.t_imu[edges],
-                   np.searchsorted(edges, keyframes))
+        return cls(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
+                   t=leg.t_imu[edges], keyframes=np.searchsorted(edges, keyframes))
 
     def angle_covariances(self) -> Floats:
         """Return the scatter of the attitude in each interval: covariances (K, 3, 3) rad^2."""
         T = np.diff(self.t)
-        angle = np.cumsum(self.turn, axis=0) - self.turn / 2
+        angle = np.cumsum(self.turn, axis=0) - self.turn / 2      # in the middle of each step
         share = (T / np.repeat(self.over_intervals(T), np.diff(self.keyframes)))[:, None]
         mean = self.over_intervals(angle * share)
         square = self.over_intervals(angle[:, :, None] * (angle * share)[:, None])
@@ -139,16 +137,16 @@ def _edges(t: Floats, keyframes: Ints) -> Ints:
     rounding = 1e-6     # of a step: a sample at the end of a step is not moved into it by rounding
     step = np.floor((t[first:last] - begin[interval]) / T[interval] * step_count[interval]
                     + rounding)
-    is_first = np.r_[True, (np.diff(interval) > 0) | (np.diff(step) > 0)]
-    out: Ints = np.append(np.flatnonzero(is_first), last - first) + first
+    is_first_of_step = np.r_[True, (np.diff(interval) > 0) | (np.diff(step) > 0)]
+    out: Ints = np.append(np.flatnonzero(is_first_of_step), last - first) + first
     return out
 
 
-def _summed(leg: SmootherLeg, edges: Ints) -> tuple[Floats, ...]:
+def _summed(leg: SmootherLeg, edges: Ints) -> dict[str, Floats]:
     """
-    Return turn, turn_mean, dv, dp, signals and longest of m steps, see ``ImuSteps``.
+    Return the sums of m steps by their names in ``ImuSteps``.
 
-    edges : (m + 1,) indices of the samples at their ends.
+    edges : (m + 1,) indices of the samples at the ends of the steps.
     """
     rows = slice(edges[0], edges[-1] + 1)
     t, f = leg.t_imu[rows], leg.f_b[rows]
@@ -175,15 +173,16 @@ def _summed(leg: SmootherLeg, edges: Ints) -> tuple[Floats, ...]:
     signals = np.concatenate([turn, (f[:-1] + f[1:]) / 2 * dt], axis=1)
     angle, _ = running(turn)
     mean = np.add.reduceat((angle + turn / 2) * dt, first) / np.add.reduceat(dt, first)
-    return (rotvec_from_quat(at_end[last]), mean, dv, dp, np.add.reduceat(signals, first),
-            np.maximum.reduceat(dt[:, 0], first))
+    return {'turn': rotvec_from_quat(at_end[last]), 'turn_mean': mean, 'dv': dv, 'dp': dp,
+            'signals': np.add.reduceat(signals, first),
+            'longest': np.maximum.reduceat(dt[:, 0], first)}
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:
     """Return the sigmas of white noise and random walks of an IMU of this grade, SI, by level."""
-    stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
+    sigmas = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
-    return {name: max(sigma, MIN_IMU_NOISE[name]) for name, sigma in stated.items()}
+    return {name: max(sigma, MIN_IMU_NOISE[name]) for name, sigma in sigmas.items()}
 
 
 def without_accelerometer(grade: Grade) -> Grade:
@@ -200,16 +199,16 @@ def white_noise_at_rest(imu: ImuSteps, leg: SmootherLeg, at_rest: Bools) -> dict
     stops = [slice(begin, end) for begin, end in runs(at_rest[:-1] & at_rest[1:])
              if end - begin > 2]
     # second differences contain no bias and no drift; their variance is six times as large
-    squares = [[(np.diff((x / T)[stop], n=2, axis=0)**2).sum(axis=1) * T[stop][1:-1, 0] / 6
-                for x in (turn, force)] for stop in stops]
-    both = np.concatenate([np.zeros((2, 0)), *squares], axis=1)
-    if both.shape[1] < 15:      # of three axes each: with fewer, a variance has a sigma above 30 %
+    powers = np.concatenate([np.zeros((2, 0)), *(
+        [(np.diff((x / T)[stop], n=2, axis=0)**2).sum(axis=1) * T[stop][1:-1, 0] / 6
+         for x in (turn, force)] for stop in stops)], axis=1)
+    if powers.shape[1] < 15:    # of three axes each: with fewer, a variance has a sigma above 30 %
         return {}
     # people may get in and out, or load, during most of a stop: use the quarter with least motion
     variances = {
         name: max(min(np.median(x) / CHI2_3_MEDIAN, np.quantile(x, 0.25) / CHI2_3_QUARTILE),
                   MIN_IMU_NOISE[name]**2)
-        for name, x in zip(('gyro', 'accel'), both, strict=True)}
+        for name, x in zip(('gyro', 'accel'), powers, strict=True)}
     return variances if leg.has_accelerometer else {'gyro': variances['gyro']}
 
 

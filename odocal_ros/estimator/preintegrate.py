@@ -27,10 +27,10 @@ from odocal_ros.nav.rotations import exp_so3, matrix_from_quat, rotate, skew
 from odocal_ros.nav.strapdown import prefix_product
 
 STEPS_AT_A_TIME = 2048    # judgement: they stay in the cache; 256 double the time of a pass
-# definition: indices of the signals that errors of gyro and accelerometer multiply, of: 1, turn
-# rate (3), specific force (3), x and y of the force with its bias. The g-sensitivity of the gyro
-# has the latter, so that an accelerometer bias does not turn the attitude
-OF_GYRO, OF_ACCEL = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
+# definition: columns of ``_Chunk.signals`` that errors of gyro and accelerometer multiply. The
+# columns are 1, turn rate (3), specific force (3), x and y of the force with its bias. The last
+# two are for the g-sensitivity, so that an accelerometer bias does not turn the attitude
+GYRO_COLUMNS, ACCEL_COLUMNS = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +39,13 @@ class _Sums:
 
     def take(self, rows: slice | Ints) -> Self:
         """Return the sums of some rows."""
-        return type(self)(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return type(self)(**{name: x[rows] for name, x in vars(self).items()})
 
     @classmethod
     def joined(cls, parts: list[Self]) -> Self:
         """Return the rows of all parts."""
-        return parts[0] if len(parts) == 1 else cls(**{
-            f.name: np.concatenate([getattr(x, f.name) for x in parts]) for f in fields(cls)})
+        return cls(**{f.name: np.concatenate([getattr(x, f.name) for x in parts])
+                      for f in fields(cls)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,15 +110,14 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
     sorted times between the first and the last keyframe.   constants : (M,), whose errors GYRO and
     ACCEL are subtracted.
     """
-    out, points = [], []
-    K = len(imu.keyframes) - 1
+    out, points, K = [], [], len(imu.keyframes) - 1
     interval = np.clip(np.searchsorted(imu.t_keyframes, t_points, side='right') - 1, 0, K - 1)
     size = max(1, int(STEPS_AT_A_TIME * K / len(imu.t)))
     for first in range(0, K, size):
         last = min(first + size, K)
         inside = slice(np.searchsorted(interval, first), np.searchsorted(interval, last))
         chunk = _Chunk(imu, first, last, gyro_bias[first:last], accel_bias[first:last], constants)
-        steps = chunk.steps_of(t_points[inside], interval[inside] - first)
+        steps = chunk.find_steps(t_points[inside], interval[inside] - first)
         chunk.sum_effects(steps)
         out.append(chunk.intervals(travel, forward))
         points.append(chunk.points(t_points[inside], steps, interval[inside] - first, first))
@@ -142,9 +141,9 @@ class _Chunk:
 
     Of n steps, in the axes of b at the start of their interval: R, v, p : attitude, velocity and
     position at the start of the step.   step_v, step_p : single and double integral of the force
-    over it.   R_mean, R_double : the same of R, over dt.   time_since_start : s, of the step.
-    Of intervals: first, end : first step, and first one after it.   R_end, dv, dp.   by_gyro,
-    by_accel : M_g and M_a of docs/method.md (S3).
+    over the step.   R_mean, R_double : the same integrals of R, over dt.   time_since_start : s.
+    Of intervals: first, end : first step, and first step after the interval.   R_end, dv, dp : see
+    ``Intervals``.   by_gyro, by_accel : M_g and M_a of docs/method.md (S3).
     """
 
     def __init__(self, imu: ImuSteps, first: int, last: int, gyro_bias: Floats,
@@ -157,15 +156,14 @@ class _Chunk:
         self.dt = np.diff(self.t)
         self.longest, dt = imu.longest[rows], self.dt[:, None]
         biases = np.concatenate([gyro_bias, accel_bias], axis=1)[self.interval] * dt
-        # integrals over each step of the signals of OF_GYRO and OF_ACCEL
-        self.signals = np.concatenate([dt, imu.signals[rows] - biases, imu.signals[rows, 3:5]],
-                                      axis=1)
+        # integrals of the signals over each step, columns as in GYRO_COLUMNS
+        self.signals = np.column_stack([dt, imu.signals[rows] - biases, imu.signals[rows, 3:5]])
         self.by_gyro, self.by_accel = np.zeros((3, 5)), np.zeros((3, 3))
         if constants is not None:
             self.by_gyro[layout.GYRO_AXIS, layout.GYRO_SIGNAL] = constants[layout.GYRO]
             self.by_accel[layout.ACCEL_AXIS, layout.ACCEL_SIGNAL] = constants[layout.ACCEL]
-        gyro = biases[:, :3] + self.signals[:, OF_GYRO[1:]] @ self.by_gyro.T
-        accel = biases[:, 3:] + self.signals[:, OF_ACCEL[1:]] @ self.by_accel.T
+        gyro = biases[:, :3] + self.signals[:, GYRO_COLUMNS[1:]] @ self.by_gyro.T
+        accel = biases[:, 3:] + self.signals[:, ACCEL_COLUMNS[1:]] @ self.by_accel.T
         self.turn, self.turn_mean = imu.turn[rows] - gyro, imu.turn_mean[rows] - gyro / 2
         square = skew(self.turn) @ skew(self.turn)
         # integral of the attitude over a step of unit length, and the integral of that
@@ -207,7 +205,7 @@ class _Chunk:
         start = before[self.first]
         return before - start[self.interval], total[self.end - 1] - start
 
-    def steps_of(self, t: Floats, interval: Ints) -> Ints:
+    def find_steps(self, t: Floats, interval: Ints) -> Ints:
         """Return the step that each time lies in."""
         return np.clip(np.searchsorted(self.t, t, side='right') - 1, self.first[interval],
                        self.end[interval] - 1)
@@ -224,12 +222,14 @@ class _Chunk:
         dt, signals = self.dt[:, None], self.signals
         end, v, p = self.time_since_start[:, None] + dt, self.v + self.step_v, self.p + self.v * dt
         moment, R_growth = self.step_v - self.step_p / dt, self.R @ self.growth
-        self.effects = [self._sums_before_cuts(*one) for one in (
-            (self.R_mean, signals),      # then v by rotations, p by rotations, p by forces
-            (_cross(v, self.R_mean) - _cross(moment, R_growth), signals[:, OF_GYRO]),
-            (_cross(p + self.step_p - v * end, self.R_mean)
-             + _cross(moment * end - self.step_v * (dt / 6), R_growth), signals[:, OF_GYRO]),
-            (self.R_double - self.R_mean * end[:, :, None], signals[:, OF_ACCEL]))]
+        gyro_signals, sums = signals[:, GYRO_COLUMNS], self._sums_before_cuts
+        self.effects = [
+            sums(self.R_mean, signals),      # rotation and v; then v by rotations, p by rotations,
+            sums(_cross(v, self.R_mean) - _cross(moment, R_growth), gyro_signals),
+            sums(_cross(p + self.step_p - v * end, self.R_mean)
+                 + _cross(moment * end - self.step_v * (dt / 6), R_growth), gyro_signals),
+            sums(self.R_double - self.R_mean * end[:, :, None],      # and p by forces
+                 signals[:, ACCEL_COLUMNS])]
 
     def _sums_before_cuts(self, step: Floats, signals: Floats) -> Floats:
         """Return the sums of (n, 3, 3) times signals (n, s) before each cut and up to the last."""
@@ -238,16 +238,21 @@ class _Chunk:
         return np.cumsum(out, axis=0, out=out)
 
     def _effects(self, begin: Ints, end: Ints, dv: Floats, dp: Floats,
-                 tau: Floats) -> tuple[Floats, ...]:
-        """Return A to FF and the derivatives by the gyro, of errors in steps between (m,) cuts."""
+                 tau: Floats) -> dict[str, Floats]:
+        """
+        Return A to dp_by_gyro of ``Intervals`` by name, from errors in steps between (m,) cuts.
+
+        dv, dp : (m, 3) at the end.   tau : (m, 1, 1) s, from the start to the end.
+        """
         first, last = (np.searchsorted(self.cuts, x) for x in (begin, end))
-        both, velocity, position, position_by_force = (x[last] - x[first] for x in self.effects)
-        by_turn, force = self._gyro_effects(both[..., OF_GYRO]), both[..., OF_ACCEL]
+        by_all, velocity, position, position_by_force = (x[last] - x[first] for x in self.effects)
+        by_turn, force = self._gyro_effects(by_all[..., GYRO_COLUMNS]), by_all[..., ACCEL_COLUMNS]
         velocity = self._gyro_effects(velocity)
         A, F = self._accel_effects(force)
         AA, FF = self._accel_effects(force * tau[..., None] + position_by_force)
-        return (A, AA, F, FF, by_turn, _cross(dv, by_turn) - velocity,
-                _cross(dp, by_turn) - velocity * tau - self._gyro_effects(position))
+        return {'A': A, 'AA': AA, 'F': F, 'FF': FF, 'R_by_gyro': by_turn,
+                'dv_by_gyro': _cross(dv, by_turn) - velocity,
+                'dp_by_gyro': _cross(dp, by_turn) - velocity * tau - self._gyro_effects(position)}
 
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""
@@ -259,17 +264,17 @@ class _Chunk:
         in_step = forward_x / 2 + (turn_x @ forward_x + skew(np.cross(self.turn, forward))) / 6
         S_by_gyro = np.add.reduceat(_times(
             _cross(path_after, self.R_mean) + self.R @ in_step * ds[:, :, None],
-            self.signals[:, OF_GYRO]), self.first)
-        A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
-            self.first, self.end, self.dv, self.dp, T[:, None, None])
-        rate, force = np.hsplit(
-            np.add.reduceat(self.signals[:, 1:7], self.first) / T[:, None], 2)
-        return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, R_by_gyro, dv_by_gyro,
-                         dp_by_gyro, np.add.reduceat(S, self.first), self._gyro_effects(S_by_gyro),
-                         rate, force, np.maximum.reduceat(self.longest, self.first))
+            self.signals[:, GYRO_COLUMNS]), self.first)
+        effects = self._effects(self.first, self.end, self.dv, self.dp, T[:, None, None])
+        rate, force = np.hsplit(np.add.reduceat(self.signals[:, 1:7], self.first) / T[:, None], 2)
+        return Intervals(T, self.R_end, self.dv, self.dp, **effects,
+                         S=np.add.reduceat(S, self.first), S_by_gyro=self._gyro_effects(S_by_gyro),
+                         mean_rate=rate, mean_force=force,
+                         longest_step=np.maximum.reduceat(self.longest, self.first))
 
     def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:
-        """Return the sums to times t in steps j: rate and force change uniformly in a step."""
+        """Return sums to times t in steps j; interval : in the chunk.   first : its first one."""
+        # rate and force change uniformly within a step
         h, dt = (t - self.t[j])[:, None], self.dt[j, None]
         force_change = (6 * self.step_v[j] - 12 * self.step_p[j] / dt) / dt**2
         force = self.step_v[j] / dt - force_change * dt / 2
@@ -279,18 +284,17 @@ class _Chunk:
         rate = self.turn[j] / dt - rate_change * dt / 2
         R = self.R[j] @ exp_so3(rate * h + rate_change * h**2 / 2)
         tau = t - self.t[self.first[interval]]
-        A, AA, F, FF, R_by_gyro, dv_by_gyro, dp_by_gyro = self._effects(
-            self.first[interval], j, dv, dp, tau[:, None, None])
-        # the effects of errors in the step up to the time
+        effects = self._effects(self.first[interval], j, dv, dp, tau[:, None, None])
+        # errors in the step up to the time
         share, signals = (h / dt)[:, None], self.signals[j]
-        turn = self._gyro_effects(_times(self.R_mean[j] * share, signals[:, OF_GYRO]))
-        step_dv = self.step_v[j] * (h / dt)
-        (A, F), (AA, FF) = (
-            (x + y for x, y in zip(
-                before, self._accel_effects(_times(step, signals[:, OF_ACCEL])), strict=True))
-            for before, step in (((A, F), self.R_mean[j] * share),
-                                 ((AA, FF), self.R_double[j] * share**2)))
-        return Points(interval + first, tau, dv, dp, R, A, AA, F, FF, R_by_gyro + turn,
-                      dv_by_gyro + _cross(step_dv / 2, turn),
-                      dp_by_gyro + _cross(step_dv * h / 6, turn), force + force_change * h,
-                      rate + rate_change * h, rate_change, signals[:, 1:7] / dt)
+        turn = self._gyro_effects(_times(self.R_mean[j] * share, signals[:, GYRO_COLUMNS]))
+        step_dv, accel = self.step_v[j] * (h / dt), signals[:, ACCEL_COLUMNS]
+        A, F = self._accel_effects(_times(self.R_mean[j] * share, accel))
+        AA, FF = self._accel_effects(_times(self.R_double[j] * share**2, accel))
+        in_step = {'A': A, 'AA': AA, 'F': F, 'FF': FF, 'R_by_gyro': turn,
+                   'dv_by_gyro': _cross(step_dv / 2, turn),
+                   'dp_by_gyro': _cross(step_dv * h / 6, turn)}
+        return Points(interval + first, tau, dv, dp, R,
+                      **{name: x + in_step[name] for name, x in effects.items()},
+                      force=force + force_change * h, rate=rate + rate_change * h,
+                      rate_change=rate_change, measured=signals[:, 1:7] / dt)

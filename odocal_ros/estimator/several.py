@@ -55,21 +55,22 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     includes their scatter (LEGS_DISAGREE). With ``leg.automatic`` a scale may change permanently
     between two legs (SCALE_CHANGED).
     """
-    order = np.argsort(times_ns, kind='stable')
-    legs, times = [results[i] for i in order], np.asarray(times_ns)[order]
-    leg_numbers = [(numbers or range(1, len(results) + 1))[i] for i in order]
+    by_time = np.argsort(times_ns, kind='stable')
+    legs, times = [results[i] for i in by_time], np.asarray(times_ns)[by_time]
+    leg_numbers = [(numbers or range(1, len(results) + 1))[i] for i in by_time]
     joint, changes = _fit(legs, times, config)
-    at = [joint.names.index(name) for name in CONSTANTS]
+    order = [joint.names.index(name) for name in CONSTANTS]
     common = _common_sources(legs)
-    C = with_model_floor(joint.covariance[np.ix_(at, at)])
+    C = with_model_floor(joint.covariance[np.ix_(order, order)])
     C[:PARAMETER_COUNT, :PARAMETER_COUNT] += sum(s.effects @ s.effects.T for s in common)
     sigma = np.sqrt(np.diag(C))
-    fitted = FittedConstants(joint.value[at], sigma, sigma / joint.factor / joint.prior_sigma[at])
+    fitted = FittedConstants(joint.value[order], sigma,
+                             sigma / joint.factor / joint.prior_sigma[order])
     wheels = wheel_result.combine_wheels(legs)
     estimates, refusals = _estimate(legs, fitted, wheels, config, local)
-    sources = _error_sources(joint.relaxed_sigma[at] * joint.factor, C, common)
+    sources = _error_sources(joint.relaxed_sigma[order] * joint.factor, C, common)
     # a pitch without a prior: some leg has an accelerometer
-    grade = grade_of(config.imu) if np.isinf(joint.prior_sigma[at][PITCH]) else None
+    grade = grade_of(config.imu) if np.isinf(joint.prior_sigma[order][PITCH]) else None
     details = _details(joint, fitted.value, C, sources, len(legs)) | {
         'beside': additional_figures(fitted.value, C, grade)} | wheel_result.wheel_details(wheels)
     reasons = (*(_scale_change_reason(change, times, leg_numbers) for change in changes),
@@ -93,8 +94,8 @@ def _fit(legs: Sequence[MethodResult], times_ns: Ints,
 
 
 def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants,
-              wheels: dict[str, wheel_result.Wheel], config: Config,
-              local: bool) -> tuple[dict[str, Estimate], list[Reason]]:
+              wheels: dict[str, wheel_result.Wheel], config: Config, local: bool
+              ) -> tuple[dict[str, Estimate], list[Reason]]:
     """Return the estimates of the legs together, and the reasons for those not determined."""
     scales = ((leg.estimates[name].value for name in ('scale_factor', 'scale_ratio'))
               for leg in legs)
@@ -103,9 +104,9 @@ def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants,
                                              nominal, config)
     estimates |= combine_as_sent(legs, estimates['scale_factor'])
     if wheels:
-        of_wheels, reasons = wheel_result.wheel_estimates(
-            wheels, wheels, estimates['scale_factor'], config)
-        estimates, refusals = estimates | of_wheels, refusals + reasons
+        wheel_estimates, reasons = wheel_result.wheel_estimates(
+            list(wheels), wheels, estimates['scale_factor'], config)
+        estimates, refusals = estimates | wheel_estimates, refusals + reasons
     estimates |= last_leg_values(
         legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     undetermined = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
@@ -117,21 +118,20 @@ def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants,
 def _share_sizes(marginals: Sequence[MarginalInformation]) -> list[MarginalInformation]:
     """Return marginals with equal sigmas of the imperfections: means weighted by information."""
     imperfect = set(CONSTANTS[IMPERFECTIONS])
-    logs: dict[str, list[tuple[float, float]]] = {}
+    weighted_logs: dict[str, list[tuple[float, float]]] = {}      # of the sigmas, with weights
     for marginal in marginals:
         prior = 1 / marginal.relaxed_sigma**2
         data = 1 / np.diag(np.linalg.inv(marginal.information + np.diag(prior))) - prior
-        known = data / (data + 1 / (SIZE * marginal.prior_sigma**2))        # docs/method.md (S29)
-        for name, sigma, weight in zip(marginal.names, marginal.relaxed_sigma, known, strict=True):
+        share = data / (data + 1 / (SIZE * marginal.prior_sigma**2))        # docs/method.md (S29)
+        for name, sigma, weight in zip(marginal.names, marginal.relaxed_sigma, share, strict=True):
             if name in imperfect:
-                logs.setdefault(name, []).append((np.log(sigma), max(weight, 1e-9)))
+                weighted_logs.setdefault(name, []).append((np.log(sigma), max(weight, 1e-9)))
     means = {}
-    for name, pairs in logs.items():
+    for name, pairs in weighted_logs.items():
         log, weight = np.transpose(pairs)
         means[name] = float(np.exp(np.average(log, weights=weight)))
-    return [replace(marginal, relaxed_sigma=np.array([
-        means.get(name, sigma) for name, sigma in zip(
-            marginal.names, marginal.relaxed_sigma, strict=True)])) for marginal in marginals]
+    return [replace(x, relaxed_sigma=np.array([means.get(name, sigma) for name, sigma in zip(
+        x.names, x.relaxed_sigma, strict=True)])) for x in marginals]
 
 
 def _scale_change_reason(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
@@ -158,11 +158,11 @@ def _disagreement_reasons(joint: JointEstimate, numbers: list[int]) -> tuple[Rea
         if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
             continue
         # two legs have the same deviation from each other
-        who = (f'; {_leg_name(numbers[k])} differs most: {z[k]:+z.1f} sigma from the value of '
-               'all legs') * (J > 2)
+        largest = (f'; {_leg_name(numbers[k])} differs most: {z[k]:+z.1f} sigma from the value of '
+                   'all legs') * (J > 2)
         reasons.append(Reason(
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
-            f'times their uncertainties{who}', DELAY_REMEDY if 'delay' in name else ''))
+            f'times their uncertainties{largest}', DELAY_REMEDY if 'delay' in name else ''))
     if joint.factor > 1:
         in_others = ' in all parameters but scale, yaw and pitch' * bool(joint.scatter)
         reasons.append(Reason(
@@ -191,8 +191,7 @@ def _common_sources(legs: Sequence[MethodResult]) -> list[Source]:
     return list(largest.values())
 
 
-def _error_sources(prior_sigma: Floats, C: Floats,
-                   common: Sequence[Source]) -> tuple[Source, ...]:
+def _error_sources(prior_sigma: Floats, C: Floats, common: Sequence[Source]) -> tuple[Source, ...]:
     """Return the budget: shared errors of the vehicle, and all errors of single legs as one."""
     sigmas = np.sqrt(np.outer(np.diag(C)[:PARAMETER_COUNT], np.diag(C)))
     correlation = np.abs(C[:PARAMETER_COUNT] / sigmas).max(axis=0)

@@ -87,9 +87,9 @@ def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fi
     del current             # its equations: only one fit is in memory at a time
     is_offset = np.arange(M) == SPEED_OFFSET
     priors, initial_priors = (
-        replace(one, mean=np.where(is_offset, nearer, one.mean),
-                sigma=np.where(is_offset, 1e-3 * coarse.step, one.sigma))     # practically fixed
-        for one in (summary.priors, summary.initial_priors))
+        replace(x, mean=np.where(is_offset, nearer, x.mean),
+                sigma=np.where(is_offset, 1e-3 * coarse.step, x.sigma))     # practically fixed
+        for x in (summary.priors, summary.initial_priors))
     warm_start = replace(summary, priors=priors, initial_priors=initial_priors)
     last = fit(problem, replace(warm_start.state, constants=constants), warm_start.levels,
                WARM_START_PASSES, warm_start=warm_start, frozen=True, trace=trace)
@@ -103,9 +103,9 @@ def _fit_from_starts(problem: Problem, config: Config, trace: Trace | None) -> F
     if len(starts) == 1:
         return fit(problem, starts[0].state, _initial_levels(problem, starts[0]), passes,
                    trace=trace)
-    trials = (fit(problem, one.state, _initial_levels(problem, one), TRIAL_PASSES, trace=trace)
-              for one in starts)
-    warm_start = max(trials, key=lambda f: f.likelihood).summary()
+    trials = (fit(problem, start.state, _initial_levels(problem, start), TRIAL_PASSES, trace=trace)
+              for start in starts)
+    warm_start = max(trials, key=lambda trial: trial.likelihood).summary()
     last = fit(problem, warm_start.state, warm_start.levels, passes, warm_start=warm_start,
                trace=trace)
     return replace(last, iterations=warm_start.iterations + last.iterations)
@@ -117,9 +117,9 @@ def _initial_levels(problem: Problem, start: Start) -> Levels:
         (start.fix_scatter, problem.fix_sigma), (2 * start.fix_scatter, problem.height_sigma)))
     configured = problem.correlation_time
     correlation_time = USUAL_TIME if np.isnan(configured) else configured
-    leg = problem.leg
-    long = leg.has_accelerometer and leg.t_stop - leg.t_begin > RECEIVER_ODOMETER_LEG
-    sizes = {'size_fix_error_by_motion': RECEIVER_ODOMETER_SIZE} if long else {}
+    leg, sizes = problem.leg, {}
+    if leg.has_accelerometer and leg.t_stop - leg.t_begin > RECEIVER_ODOMETER_LEG:
+        sizes['size_fix_error_by_motion'] = RECEIVER_ODOMETER_SIZE
     return problem.initial_levels.replaced(
         fix=WHITE_SHARE * factor, fix_up=4.0 * WHITE_SHARE * factor_up,
         correlation_time=correlation_time, **sizes, **problem.vibrating_levels)
@@ -130,19 +130,19 @@ def missing_samples_reason(leg: SmootherLeg) -> Reason | None:
     _, t = imu_rows(leg)
     if len(t) < 2:
         return too_few_samples_reason(0, 0.0)
-    within = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-    return too_few_samples_reason(int(within.sum()), float(t[-1] - t[0]))
+    fixes = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
+    return too_few_samples_reason(int(fixes.sum()), float(t[-1] - t[0]))
 
 
 def too_few_samples_reason(fixes: int, seconds: float) -> Reason | None:
     """Return the reason if a number of fixes, or their duration, is too small, else None."""
-    fewest, shortest = 10, 20.0     # fixes, s: judgement, with less no cold start is found
-    if fixes >= fewest and seconds >= shortest:
+    min_fixes, min_seconds = 10, 20.0     # judgement: with less, a cold start fails
+    if fixes >= min_fixes and seconds >= min_seconds:
         return None
     # rounded down: 19.97 s are less than 20
-    span = np.floor(10 * seconds) / 10
-    return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes and {span:.1f} s of '
-                  f'data; the smoother needs at least {fewest} fixes and {shortest:.0f} s')
+    return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes and '
+                  f'{np.floor(10 * seconds) / 10:.1f} s of data; the smoother needs at least '
+                  f'{min_fixes} fixes and {min_seconds:.0f} s')
 
 
 def cramer_rao_bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels) -> Floats:

@@ -21,7 +21,7 @@ from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.rotations import exp_so3, skew
 
 # unknowns of a keyframe in order, and their numbers. The travel error is that of the odometer
-# reading, in scale units, bounded by rounding; the slow error is the time-correlated one of a fix
+# reading, in scale units, bounded by rounding; the slow fix error is the time-correlated one
 BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
          'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU': 3}
 P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
@@ -65,7 +65,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
 
 
 def constants_from(first: str, last: str = '') -> slice:
-    """Return the slice of constants from one name to another, the last included, or of one."""
+    """Return the slice of constants from ``first`` to ``last``, included; without it, of one."""
     return slice(CONSTANTS.index(first), CONSTANTS.index(last or first) + 1)
 
 
@@ -151,7 +151,7 @@ NO_ERROR = 1e-12    # definition: prior sigma of a constant that is fixed, in an
 class State:
     """Values of all unknowns; position, velocity, attitude and biases are those of the IMU."""
 
-    t: Floats             # (N,) s, keyframes
+    t: Floats             # (N,) s, times of the keyframes
     p_n: Floats           # (N, 3) m
     v_n: Floats           # (N, 3) m/s
     C_nb: Floats          # (N, 3, 3) from b, the IMU's axes, to n: east, north, up at the origin
@@ -160,8 +160,7 @@ class State:
     travel_error: Floats  # (N,) scale units
     slow_n: Floats        # (N, 3) m, time-correlated fix error
     constants: Floats     # (M,) as CONSTANTS, ln K first
-    # (3,) up axis of n in b, mean of the leg: with the mean roll of the ground, it determines the
-    # roll of the IMU in the vehicle
+    # (3,) up axis of n in b, mean of the leg, which gives the roll of the IMU in the vehicle
     up_b: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     @cached_property
@@ -199,14 +198,15 @@ class State:
         yaw, pitch = self.constants[[YAW, PITCH]]
         cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
         forward, left, _ = self.C_bv_level.T
-        size = np.linalg.norm(np.cross(self.up_b, forward))
+        length = np.linalg.norm(np.cross(self.up_b, forward))
         roll = exp_so3(np.array([self.constants[MEAN_ROLL], 0.0, 0.0]))
 
-        def gradient(by_forward: Floats) -> Floats:
-            by_left = np.cross(self.up_b, by_forward) / size
-            by_left = by_left - left * (left @ by_left)
-            return np.stack([by_forward, by_left, np.cross(by_forward, left)
-                             + np.cross(forward, by_left)], -1) @ roll
+        def gradient(d_forward: Floats) -> Floats:
+            """Return the derivative of C_bv from that of the forward axis."""
+            d_left = np.cross(self.up_b, d_forward) / length
+            d_left = d_left - left * (left @ d_left)
+            return np.stack([d_forward, d_left, np.cross(d_forward, left)
+                             + np.cross(forward, d_left)], -1) @ roll
         return (gradient(np.array([-sy * cp, -cy, -sy * sp])),
                 gradient(np.array([-cy * sp, 0.0, cy * cp])),
                 self.C_bv @ skew(np.array([1.0, 0.0, 0.0])))

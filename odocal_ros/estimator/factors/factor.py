@@ -130,18 +130,22 @@ def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | fl
               residual: Floats | float, weight: Floats | float = 1.0) -> None:
     """Add priors of columns at keyframes k; residual : value minus mean.   weight 0 : no prior."""
     i = np.arange(out.g.shape[1])[columns]
-    keys = np.atleast_1d(np.arange(len(out.g))[k])
-    information, gradient = (np.broadcast_to(x, (len(keys), len(i)))
+    keyframes = np.atleast_1d(np.arange(len(out.g))[k])[:, None]
+    information, gradient = (np.broadcast_to(x, (len(keyframes), len(i)))
                              for x in (weight / variance, weight * residual / variance))
-    for rows in blocks(len(keys)):
-        at = keys[rows, None]
-        out.diagonal[at, i, i] += information[rows]
-        out.g[at, i] -= gradient[rows]
+    for rows in blocks(len(keyframes)):
+        out.diagonal[keyframes[rows], i, i] += information[rows]
+        out.g[keyframes[rows], i] -= gradient[rows]
 
 
 def add_process(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
                 residual: Floats) -> None:
-    """Add a process; residual : (K, c), value at the end minus decay times that at the start."""
+    """
+    Add a Gauss-Markov process, or with decay 1 a random walk, of columns of the keyframes.
+
+    weight : inverse variance of the driving noise.   residual : (K, c) this noise at the state,
+    the value at the end of each interval minus decay times the value at its start.
+    """
     i = np.arange(out.g.shape[1])[columns]
     shape = np.broadcast_shapes(np.shape(residual), (len(out.upper), len(i)))
     terms = (decay**2 * weight, weight, decay * weight, decay * weight * residual,

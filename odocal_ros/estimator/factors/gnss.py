@@ -94,29 +94,29 @@ class Fixes(PointRows):
         # by the correlated error of the keyframe before; J_end has that of the keyframe after
         tau = self.points.tau[:, None, None]
         m = len(tau)
-        one = np.broadcast_to(np.eye(3), (m, 3, 3))
-        J, c = np.zeros((m, 3, n)), np.zeros((m, 3, layout.M))
-        J[:, :, layout.P], J[:, :, layout.V] = -one, -one * tau
+        eye = np.eye(3)
+        J, J_c = np.zeros((m, 3, n)), np.zeros((m, 3, layout.M))
+        J[:, :, layout.P], J[:, :, layout.V] = -eye, -eye * tau
         J[:, :, layout.PHI] = skew(self.dp + self.arm_n)
         J[:, :, layout.BA] = self.C @ self.points.AA
         by_gyro = -self.C @ self.points.dp_by_gyro - skew(
             self.arm_n) @ self.C @ self.points.R_by_gyro
-        J[:, :, layout.BG], c[:, :, layout.GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
+        J[:, :, layout.BG], J_c[:, :, layout.GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
         if n > layout.SIZE_WITHOUT_SLOW:
-            J[:, :, layout.SLOW] = -one * (1 - self.share)[:, None, None]
+            J[:, :, layout.SLOW] = -eye * (1 - self.share)[:, None, None]
         for column, gradient in zip(layout.AXES, self.state.C_bv_gradient, strict=True):
-            c[:, :, column] = -self.C_nb @ (gradient @ self.arm_v)
-        c[:, :, layout.GNSS_ARM] = -self.C_nb @ self.state.C_bv
+            J_c[:, :, column] = -self.C_nb @ (gradient @ self.arm_v)
+        J_c[:, :, layout.GNSS_ARM] = -self.C_nb @ self.state.C_bv
         # a stamp that is late by d belongs to the position d earlier
-        c[:, :, layout.GNSS_DELAY] = self.v_n
-        c[:, :, layout.GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
-        c[:, 2, layout.HEIGHT_DRIFT] = -self.t_fix
-        c[:, :, layout.FIX_ERROR_BY_SIGMA] = -self.by_sigma[:, :, None] * np.eye(3)
-        c[:, :, layout.FIX_LAG2] = -self.by_lag
-        c[:, :, layout.FIX_BY_MOTION] = -self.by_motion
-        c[:, :, layout.FIX_MOTION_TIME] = -self.by_time
-        c[:, :, layout.ACCEL] = self.C @ (self.points.FF + self.signal_noise * tau**2 / 2)
-        return J, c
+        J_c[:, :, layout.GNSS_DELAY] = self.v_n
+        J_c[:, :, layout.GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
+        J_c[:, 2, layout.HEIGHT_DRIFT] = -self.t_fix
+        J_c[:, :, layout.FIX_ERROR_BY_SIGMA] = -self.by_sigma[:, :, None] * np.eye(3)
+        J_c[:, :, layout.FIX_LAG2] = -self.by_lag
+        J_c[:, :, layout.FIX_BY_MOTION] = -self.by_motion
+        J_c[:, :, layout.FIX_MOTION_TIME] = -self.by_time
+        J_c[:, :, layout.ACCEL] = self.C @ (self.points.FF + self.signal_noise * tau**2 / 2)
+        return J, J_c
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
@@ -129,8 +129,8 @@ class Fixes(PointRows):
         out: Floats = t - constants[layout.GNSS_DELAY] - constants[layout.GNSS_CLOCK] * t
         return out
 
-    def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        return self.whitening[some] @ rows
+    def whiten(self, x: Floats, rows: slice = slice(None)) -> Floats:
+        return self.whitening[rows] @ x
 
     def existing_components(self) -> Bools:
         exists = np.ones((len(self.k), 3), bool)
@@ -180,11 +180,11 @@ class VelocityRows(ExternalRows):
         # without an accelerometer the change of velocity between keyframes is unknown
         if not (config.gnss.use_velocity and len(t) and inputs.has_accelerometer):
             return None
-        some = thinning(t)
-        t, variance = t[some], samples.variance_n[some, :2]
-        known = np.isfinite(variance) & (variance > 0)
-        sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
-        v_n = (enu_to_n(inputs, t, origin) @ samples.velocity_n[some, :, None])[:, :2, 0]
+        rows = thinning(t)
+        t, variance = t[rows], samples.variance_n[rows, :2]
+        is_stated = np.isfinite(variance) & (variance > 0)
+        sigma = np.sqrt(np.where(is_stated, variance, VELOCITY_SIGMA**2))
+        v_n = (enu_to_n(inputs, t, origin) @ samples.velocity_n[rows, :, None])[:, :2, 0]
         return Velocity(t, sigma, v_n)
 
     @staticmethod
@@ -213,25 +213,25 @@ class VelocityRows(ExternalRows):
         factor = 1 + state.constants[layout.VELOCITY_SCALE]
         m, rate = len(k), point.intervals.mean_rate[k]
         measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
-        J, c = np.zeros((m, 3, layout.SIZE_WITHOUT_SLOW)), np.zeros((m, 3, layout.M))
+        J, J_c = np.zeros((m, 3, layout.SIZE_WITHOUT_SLOW)), np.zeros((m, 3, layout.M))
         J[:, :, layout.V] = -np.eye(3)
         J[:, :, layout.PHI] = skew(dv + swing)
         J[:, :, layout.BA] = C @ points.A
         by_gyro = -C @ points.dv_by_gyro - skew(swing) @ C @ points.R_by_gyro
         by_rate = -C_nb @ skew(arm_b)
         J[:, :, layout.BG] = by_gyro[:, :, :3] + by_rate
-        c[:, :, layout.GYRO] = by_gyro[:, :, 3:] + (
+        J_c[:, :, layout.GYRO] = by_gyro[:, :, 3:] + (
             by_rate[:, :, layout.GYRO_AXIS] * measured[:, :, layout.GYRO_SIGNAL])
         W = C_nb @ skew(rate)
         for column, gradient in zip(layout.AXES, state.C_bv_gradient, strict=True):
-            c[:, :, column] = -W @ (gradient @ arm_v)
-        c[:, :, layout.GNSS_ARM] = -W @ state.C_bv
-        c[:, :, layout.VELOCITY_DELAY], c[:, :, layout.VELOCITY_LAG2] = acceleration, -by_lag
-        c[:, :, layout.ACCEL] = C @ force_signals(
+            J_c[:, :, column] = -W @ (gradient @ arm_v)
+        J_c[:, :, layout.GNSS_ARM] = -W @ state.C_bv
+        J_c[:, :, layout.VELOCITY_DELAY], J_c[:, :, layout.VELOCITY_LAG2] = acceleration, -by_lag
+        J_c[:, :, layout.ACCEL] = C @ force_signals(
             rotate(transpose(C), acceleration - g)) * tau[:, :, None]
-        J, c = J[:, :2] * factor, c[:, :2] * factor
-        c[:, :, layout.VELOCITY_SCALE] = -v[:, :2]
-        return samples.velocity_n - factor * v[:, :2], J, c
+        J, J_c = J[:, :2] * factor, J_c[:, :2] * factor
+        J_c[:, :, layout.VELOCITY_SCALE] = -v[:, :2]
+        return samples.velocity_n - factor * v[:, :2], J, J_c
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:

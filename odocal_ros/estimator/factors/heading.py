@@ -84,12 +84,12 @@ class HeadingRows(ExternalRows):
         # derivative of the yaw by a rotation vector in n
         yaw_by_rotation = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
                                     np.ones(len(k))], -1)
-        J, c = np.zeros((len(k), 1, SIZE_WITHOUT_SLOW)), np.zeros((len(k), 1, M))
+        J, J_c = np.zeros((len(k), 1, SIZE_WITHOUT_SLOW)), np.zeros((len(k), 1, M))
         J[:, 0, PHI] = -yaw_by_rotation
         by_gyro = np.einsum('ki,kij->kj', yaw_by_rotation, C @ points.R_by_gyro)
-        J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
-        c[:, 0, HEADING] = -1.0
-        return residual[:, None], J, c
+        J[:, 0, BG], J_c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
+        J_c[:, 0, HEADING] = -1.0
+        return residual[:, None], J, J_c
 
 
 def _from_orientations(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float,

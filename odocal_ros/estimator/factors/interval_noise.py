@@ -139,7 +139,7 @@ class IntervalNoise:
         motion = self.motion.take(rows)
         T, C = motion.T[:, 0], motion.C
         force, displacement = skew(motion.dv / motion.T), skew(motion.displacement / motion.T)
-        one = np.broadcast_to(np.eye(3), (len(T), 3, 3))
+        eye = np.eye(3)
         out = np.zeros((len(T), ROWS, len(self.component)))
         imu_columns = 3 * len(IMU)      # of each Gauss point
         for point, (x, weight) in enumerate(zip(GAUSS_X, GAUSS_W, strict=True)):
@@ -147,14 +147,14 @@ class IntervalNoise:
             at_point = out[:, :, imu_columns * point:imu_columns * (point + 1)]
             gyro, accel, gyro_walk, accel_walk = (
                 at_point[:, :, first:first + 3] for first in range(0, imu_columns, 3))
-            gyro[:, PHI], gyro[:, V] = -one, force * u
+            gyro[:, PHI], gyro[:, V] = -eye, force * u
             gyro[:, P], gyro[:, D] = force * (u**2 / 2), displacement * u
-            accel[:, V], accel[:, P] = one, one * u
+            accel[:, V], accel[:, P] = eye, eye * u
             gyro_walk[:, PHI], gyro_walk[:, V] = -C * u, force @ C * (u**2 / 2)
             gyro_walk[:, P] = force @ C * (u**3 / 6)
-            gyro_walk[:, D], gyro_walk[:, BG] = displacement @ C * (u**2 / 2), one
+            gyro_walk[:, D], gyro_walk[:, BG] = displacement @ C * (u**2 / 2), eye
             accel_walk[:, V], accel_walk[:, P] = -C * u, -C * (u**2 / 2)
-            accel_walk[:, BA] = one
+            accel_walk[:, BA] = eye
             root = np.sqrt(weight * T)[:, None] * np.repeat(self.imu[rows], 3, axis=1)
             at_point *= root[:, None]
         for k, axis in enumerate(ROAD.values()):

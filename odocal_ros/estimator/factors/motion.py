@@ -203,45 +203,43 @@ class Motion:
     def jacobians(self, n: int) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by start, end and constants: (K, 18, n), (K, 18, n), (K, 18, M)."""
         s, C, state = self.sums, self.C, self.state
-        K, T = len(self.T), self.T[:, :, None]
-        one = np.broadcast_to(np.eye(3), (K, 3, 3))
-        a, b = np.zeros((K, ROWS, n)), np.zeros((K, ROWS, n))
+        K, T, eye = len(self.T), self.T[:, :, None], np.eye(3)
+        J_start, J_end = np.zeros((2, K, ROWS, n))
         arm_b = state.C_bv @ self.arm_v
-        a[:, P, P], a[:, P, V], a[:, P, PHI] = -one, -one * T, skew(self.dp)
+        J_start[:, P, V], J_start[:, P, PHI], J_start[:, V, PHI] = -eye * T, skew(self.dp), skew(
+            self.dv)
         gyro = np.zeros((K, ROWS, s.R_by_gyro.shape[2]))       # by the gyro's bias and constants
         gyro[:, PHI], gyro[:, V] = C @ s.R_by_gyro, -C @ s.dv_by_gyro
         gyro[:, P], gyro[:, D] = -C @ s.dp_by_gyro, -C @ s.S_by_gyro
-        a[:, :, BG] = gyro[:, :, :3]
-        # by the pitch of BODY_TILT. A bias changes little within hills: it does not
-        # affect the part of bumps
+        J_start[:, :, BG] = gyro[:, :, :3]
+        states = np.arange(BA.stop)      # rows and columns of P, V, PHI, BG and BA
+        J_start[:, states, states], J_end[:, states, states] = -1.0, 1.0
+        # by the pitch of BODY_TILT: a bias changes that on hills and in turns, not that of bumps
         _, left, up = state.C_bv_level.T
         lift = T * (C @ up)[:, :, None]
         hills, _, turns, _, _, tilted = state.constants[layout.BODY_TILT]
-        a[:, D, BG] += lift * ((hills - turns) * rotate(transpose(C), self.level_left)
-                               + turns * left + tilted * up)[:, None]
-        a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
-        a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
-        a[:, PHI, PHI] = -one
-        a[:, BG, BG] = a[:, BA, BA] = -one
-        a[:, D, P], a[:, D, PHI] = -one, skew(C @ arm_b + self.displacement)
+        J_start[:, D, BG] += lift * ((hills - turns) * rotate(transpose(C), self.level_left)
+                                     + turns * left + tilted * up)[:, None]
+        J_start[:, P, BA], J_start[:, V, BA] = C @ s.AA, C @ s.A
+        J_start[:, D, P], J_start[:, D, PHI] = -eye, skew(C @ arm_b + self.displacement)
         by_start = self._derivative_by_slope(C, arm_b, -1.0)
         by_end = self._derivative_by_slope(self.C_end, arm_b, 1.0)
-        a[:, D, P] += by_start[:, :, :3]
-        a[:, D, PHI] += by_start[:, :, 3:]
+        J_start[:, D, P] += by_start[:, :, :3]
+        J_start[:, D, PHI] += by_start[:, :, 3:]
         # on a body with roll, part of the turn about its left axis is not about the level axis
         tilt = self.rate_n[:, 2, None] * level_left(self.level_left)
-        a[:, D, PHI] -= (hills - turns) * lift * tilt[:, None]
-        a[:, D, E] = -self.f_n
-        b[:, P, P] = b[:, V, V] = b[:, PHI, PHI] = b[:, BG, BG] = b[:, BA, BA] = one
-        b[:, D, P], b[:, D, PHI], b[:, D, E] = one, -skew(self.C_end @ arm_b), self.f_n_end
-        b[:, D, P] += by_end[:, :, :3]
-        b[:, D, PHI] += by_end[:, :, 3:]
-        return a, b, self._by_constants(gyro)
+        J_start[:, D, PHI] -= (hills - turns) * lift * tilt[:, None]
+        J_start[:, D, E] = -self.f_n
+        J_end[:, D, P], J_end[:, D, PHI] = eye, -skew(self.C_end @ arm_b)
+        J_end[:, D, E] = self.f_n_end
+        J_end[:, D, P] += by_end[:, :, :3]
+        J_end[:, D, PHI] += by_end[:, :, 3:]
+        return J_start, J_end, self._by_constants(gyro)
 
     def _by_constants(self, gyro: Floats) -> Floats:
         """Return the derivatives by the constants; gyro : those by gyro bias and GYRO."""
         s, C, state = self.sums, self.C, self.state
-        c = np.zeros((len(self.T), ROWS, layout.M))
+        J_c = np.zeros((len(self.T), ROWS, layout.M))
         swing = self.C_end - C
         displacement = self.displacement
         if self.fitted:     # without sway and vertical motion, which are road noise
@@ -250,38 +248,38 @@ class Motion:
             displacement = along * np.einsum(
                 'ki,ki->k', along, self.displacement_by_state)[:, None]
         # the odometer does not count its displacement by pitching
-        c[:, D, layout.LN_K] = self.tilt_displacement - displacement
-        by_scale = c[:, D, layout.LN_K] / self.scale_ratio
-        c[:, D, layout.TYRES] = by_scale[:, :, None] * self.tyre_signals[:, None]
-        c[:, D, layout.SCALE_BY_PITCHING] = by_scale * self.half_pitch_variance[:, None]
+        J_c[:, D, layout.LN_K] = self.tilt_displacement - displacement
+        by_scale = J_c[:, D, layout.LN_K] / self.scale_ratio
+        J_c[:, D, layout.TYRES] = by_scale[:, :, None] * self.tyre_signals[:, None]
+        J_c[:, D, layout.SCALE_BY_PITCHING] = by_scale * self.half_pitch_variance[:, None]
         for column, gradient in zip(layout.AXES, state.C_bv_gradient, strict=True):
             tilt = np.einsum('ki,ki->k', self.displacement_by_state,
                              (C + self.C_end) @ gradient[:, 2] / 2)
-            c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
+            J_c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
                 + swing @ gradient @ self.arm_v + self.wheel_displacement * (
                     tilt * self.slope_gradient)[:, None]
         # lean about axes that roll
         pitch, yaw = self.lean_angles
         by_roll = state.scale * (np.outer(pitch, -self.left) - np.outer(yaw, self.up))
-        c[:, D, layout.MEAN_ROLL] -= rotate(C @ s.S, by_roll)
+        J_c[:, D, layout.MEAN_ROLL] -= rotate(C @ s.S, by_roll)
         for i, axis in enumerate((self.up, -self.left)):
             by_angle = C @ s.S @ (state.scale * axis)
             columns = slice(layout.BODY_LEAN.start + i, layout.BODY_LEAN.stop, 2)
-            c[:, D, columns] = -by_angle[:, :, None] * self.lean_accelerations[:, None, i::2]
-        c[:, D, layout.BODY_TILT] = -self.by_tilt
-        c[:, D, layout.ODO_ARM] = swing @ state.C_bv
+            J_c[:, D, columns] = -by_angle[:, :, None] * self.lean_accelerations[:, None, i::2]
+        J_c[:, D, layout.BODY_TILT] = -self.by_tilt
+        J_c[:, D, layout.ODO_ARM] = swing @ state.C_bv
         if self.by_speed_offset is not None:
-            c[:, D, layout.SPEED_OFFSET] = -self.by_speed_offset
+            J_c[:, D, layout.SPEED_OFFSET] = -self.by_speed_offset
         # a stamp that is late by d belongs to the travel d earlier
         forward = (self.f_n + self.f_n_end) / 2
         by_delay = -forward[:, :, None] * self.by_delay[:, None]
-        c[:, D, [layout.ODO_DELAY, layout.ODO_LAG2]] = by_delay
-        c[:, D, layout.ODO_CLOCK] = by_delay[:, :, 0] * self.t_middle[:, None] \
+        J_c[:, D, [layout.ODO_DELAY, layout.ODO_LAG2]] = by_delay
+        J_c[:, D, layout.ODO_CLOCK] = by_delay[:, :, 0] * self.t_middle[:, None] \
             - self.wheel_displacement
         if self.uses_speed_steps:   # only the direction of the path is used: independent of these
-            c[:, D, [layout.LN_K, layout.ODO_DELAY, layout.ODO_CLOCK, layout.ODO_LAG2,
+            J_c[:, D, [layout.LN_K, layout.ODO_DELAY, layout.ODO_CLOCK, layout.ODO_LAG2,
                      layout.SCALE_BY_PITCHING, layout.SPEED_OFFSET]] = 0.0
-            c[:, D, layout.TYRES] = 0.0
-        c[:, :, layout.GYRO] = gyro[:, :, 3:]
-        c[:, V, layout.ACCEL], c[:, P, layout.ACCEL] = C @ s.F, C @ s.FF
-        return c
+            J_c[:, D, layout.TYRES] = 0.0
+        J_c[:, :, layout.GYRO] = gyro[:, :, 3:]
+        J_c[:, V, layout.ACCEL], J_c[:, P, layout.ACCEL] = C @ s.F, C @ s.FF
+        return J_c

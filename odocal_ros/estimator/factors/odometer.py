@@ -67,10 +67,10 @@ def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
     weights = -square / 2 * SECOND_DERIVATIVE + max(square, 0.0)**1.5 / 3 * THIRD_DERIVATIVE
 
     def rolled(t: Floats) -> Floats:
-        at = stamp_of(t, constants)
+        stamp = stamp_of(t, constants)
         # at the ends the derivative of the first and last second: there are no readings beyond
-        middle = np.clip(at, travel.t[0] + STENCIL_REACH, travel.t[-1] - STENCIL_REACH)
-        out: Floats = travel.at(at) + sum(
+        middle = np.clip(stamp, travel.t[0] + STENCIL_REACH, travel.t[-1] - STENCIL_REACH)
+        out: Floats = travel.at(stamp) + sum(
             weight * travel.at(middle + step)
             for weight, step in zip(weights.tolist(), STENCIL.tolist(), strict=True))
         return out
@@ -197,12 +197,12 @@ class SpeedSteps(PointRows):
         # not more regular
         return {'steps': 1.0}, {'steps': 0.25}
 
-    def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        return rows / self.sigma[some, None, None]
+    def whiten(self, x: Floats, rows: slice = slice(None)) -> Floats:
+        return x / self.sigma[rows, None, None]
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
         state, forward_n, v_n = self.state, self.forward_n, self.v_n
-        J, c = np.zeros((len(v_n), n)), np.zeros((len(v_n), layout.M))
+        J, J_c = np.zeros((len(v_n), n)), np.zeros((len(v_n), layout.M))
         J[:, layout.V], J[:, layout.PHI] = -forward_n, -np.cross(forward_n, v_n - self.dv_n)
         J[:, layout.BA] = np.einsum('ki,kij->kj', forward_n, self.C @ self.points.A)
         arm = state.C_bv @ self.arm_v
@@ -211,21 +211,23 @@ class SpeedSteps(PointRows):
             'ki,kij->kj', np.cross(forward_n, v_n), self.C @ self.points.R_by_gyro) \
             - np.einsum('ki,kij->kj', forward_n, self.C @ self.points.dv_by_gyro)
         J[:, layout.BG] = by_gyro[:, :3] + by_rate
-        c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
+        J_c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
                                               * self.points.measured[:, layout.GYRO_SIGNAL])
         K = state.scale * self.scale_ratio
-        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.speed_gradient, K * self.instants.sign
-        c[:, layout.TYRES] = (self.speed_gradient / self.scale_ratio)[:, None] * self.tyre_signals
+        J_c[:, layout.LN_K] = self.speed_gradient
+        J_c[:, layout.SPEED_OFFSET] = K * self.instants.sign
+        by_ratio = self.speed_gradient / self.scale_ratio
+        J_c[:, layout.TYRES] = by_ratio[:, None] * self.tyre_signals
         rate = self.points.rate
         for column, gradient in zip(layout.AXES, state.C_bv_gradient, strict=True):
-            c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
+            J_c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
-        c[:, layout.ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
-        c[:, layout.ODO_DELAY] = self.acceleration
-        c[:, layout.ODO_CLOCK] = self.acceleration * self.instants.t
-        c[:, layout.ODO_LAG2] = -self.by_lag
-        c[:, layout.ACCEL] = np.einsum('ki,kij->kj', forward_n, self.C @ self.points.F)
-        return J[:, None], c[:, None]
+        J_c[:, layout.ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
+        J_c[:, layout.ODO_DELAY] = self.acceleration
+        J_c[:, layout.ODO_CLOCK] = self.acceleration * self.instants.t
+        J_c[:, layout.ODO_LAG2] = -self.by_lag
+        J_c[:, layout.ACCEL] = np.einsum('ki,kij->kj', forward_n, self.C @ self.points.F)
+        return J[:, None], J_c[:, None]
 
 
 def _within(problem: Problem) -> SpeedInstants:

@@ -33,7 +33,7 @@ from odocal_ros.settings.config import Config
 # sigmas above which a row or the slip of an interval has less weight. Statistical: 1 row in 370
 TAIL_SIGMAS = 3.0
 MIN_ROWS = 5    # judgement: with fewer, outliers and levels are not estimated
-# groups rows by interval: (m, d, c) to (intervals, d times their largest number, c)
+# groups rows by interval: (m, d, c) to (intervals, d times the largest number of rows of one, c)
 Gather = Callable[[Floats], Floats]
 
 
@@ -41,14 +41,14 @@ class PointRows(Factor):
     """
     m measurements of d components each, such as fixes.
 
-    A subclass sets raw, and share if its rows contain the correlated fix error. ``weigh`` sets r
-    (m, d), the whitened residuals, and J_end (m, 3, 3), their derivatives by that error of the
-    keyframe after, or None.
+    A subclass sets raw, and share if its rows contain the correlated fix error. ``weigh`` sets r,
+    (m, d), the whitened residuals, and J_end, (m, 3, 3), their derivatives by the correlated fix
+    error of the keyframe after, or None.
     """
 
-    level_columns: ClassVar[dict[str, slice]]     # residuals of each level, a variance factor
+    level_columns: ClassVar[dict[str, slice]]     # components whose variances a level multiplies
     source: ClassVar[str]                         # name in the budget
-    k: Ints                         # (m,) the keyframes before
+    k: Ints                         # (m,) indices of the keyframes before the rows
     raw: Floats                     # (m, d) residuals
     share: Floats | None = None     # (m,) weight of the correlated error of the keyframe after
 
@@ -65,8 +65,8 @@ class PointRows(Factor):
         """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
         raise NotImplementedError
 
-    def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        """Return rows (k, d, c) divided by the stated sigmas; some : which of the m they are."""
+    def whiten(self, x: Floats, rows: slice = slice(None)) -> Floats:
+        """Return values x of some rows, (k, d, c), divided by the stated sigmas of these rows."""
         raise NotImplementedError
 
     def existing_components(self) -> Bools | bool:
@@ -86,23 +86,23 @@ class PointRows(Factor):
         self._root = (root_weight * factor)[:, :, None]
         self.J_end = None
         if self.n == SIZE_WITH_SLOW and self.share is not None:
-            one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
-            self.J_end = -self.whiten(one) * self._root * self.share[:, None, None]
+            identity = np.broadcast_to(np.eye(3), (len(white), 3, 3))
+            self.J_end = -self.whiten(identity) * self._root * self.share[:, None, None]
         logs = np.log(np.tile(factor, (len(white), 1)))
         self.log_R = -2 * logs.sum() / self.rows_per_independent
 
     @cached_property
     def J(self) -> Floats:
         """Return the whitened derivatives: (m, d, n + M)."""
-        rows, constants = self.jacobians(self.n)
+        by_keyframe, by_constants = self.jacobians(self.n)
         out = work_array(*self.raw.shape, self.n + self.m)
-        for some in blocks(len(out)):
-            out[some, :, :self.n] = self.whiten(rows[some], some)
-            out[some, :, self.n:] = self.whiten(constants[some, :, :self.m], some)
-            out[some] *= self._root[some]
+        for rows in blocks(len(out)):
+            out[rows, :, :self.n] = self.whiten(by_keyframe[rows], rows)
+            out[rows, :, self.n:] = self.whiten(by_constants[rows, :, :self.m], rows)
+            out[rows] *= self._root[rows]
         return out
 
-    def _sizes(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
+    def _norms(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
         """Yield the components of each level, and the norms of their residuals, in sigmas."""
         for columns in self.level_columns.values():
             yield columns, np.abs(np.hypot.reduce(white[:, columns], axis=1))
@@ -110,16 +110,16 @@ class PointRows(Factor):
     def _weights(self, white: Floats) -> Floats:
         """Return weights of whitened residuals, (m, d), equal for the components of a level."""
         weight = np.ones_like(white)
-        for columns, size in self._sizes(white) if len(white) >= MIN_ROWS else ():
-            weight[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(size, 1e-12))[:, None]**2
+        for columns, norm in self._norms(white) if len(white) >= MIN_ROWS else ():
+            weight[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(norm, 1e-12))[:, None]**2
         return weight
 
     def cost(self) -> float:
         """Return the robust loss of the weights: squares, logarithms beyond TAIL_SIGMAS."""
         total = 0.0
-        for _, size in self._sizes(self.r / np.sqrt(self.weight / self.rows_per_independent)):
-            excess = np.maximum(size / TAIL_SIGMAS, 1.0)
-            total += float((np.minimum(size, TAIL_SIGMAS)**2
+        for _, norm in self._norms(self.r / np.sqrt(self.weight / self.rows_per_independent)):
+            excess = np.maximum(norm / TAIL_SIGMAS, 1.0)
+            total += float((np.minimum(norm, TAIL_SIGMAS)**2
                             + 2 * TAIL_SIGMAS**2 * np.log(excess)).sum())
         return total / self.rows_per_independent
 
@@ -154,22 +154,24 @@ class PointRows(Factor):
     def _intervals(self) -> Iterator[tuple[Ints, Gather]]:
         """Yield intervals with rows, some at a time, and the function that groups their rows."""
         present, first, count = np.unique(self.k, return_index=True, return_counts=True)
-        for some in blocks(len(present)):
-            counts, largest = count[some], int(count.max())
-            rows = slice(first[some.start], first[some.start] + counts.sum())
+        for chunk in blocks(len(present)):
+            counts = count[chunk]
+            rows = slice(first[chunk.start], first[chunk.start] + counts.sum())
+            # of each row: the interval, and the place among the rows of this interval
             interval = np.repeat(np.arange(len(counts)), counts)
             place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-            yield present[some], partial(_gather, rows, interval, place, (len(counts), largest))
+            yield present[chunk], partial(_gather, rows, interval, place,
+                                          (len(counts), int(count.max())))
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         if len(self.k) < MIN_ROWS:
             return {}
         fitted = np.concatenate([self._fitted_variances(marginals, present, gather)
                                  for present, gather in self._intervals()])
-        known = np.broadcast_to(self.existing_components(), self.r.shape)
-        r2 = np.where(known, self.r, 0.0)**2 * self.rows_per_independent
+        exists = np.broadcast_to(self.existing_components(), self.r.shape)
+        r2 = np.where(exists, self.r, 0.0)**2 * self.rows_per_independent
         return {level: (float(r2[:, columns].sum()),
-                        float(known[:, columns].sum() - fitted[:, :, columns].sum()))
+                        float(exists[:, columns].sum() - fitted[:, :, columns].sum()))
                 for level, columns in self.level_columns.items()}
 
     def add_levels(self, out: LevelRightHandSides) -> None:
@@ -247,7 +249,7 @@ class ExternalRows(PointRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> ExternalSamples | None:
-        """Return the samples of the sensor in frame n; None without any, or if not used."""
+        """Return the samples of the sensor in frame n; None if there are none or it is unused."""
         raise NotImplementedError
 
     @staticmethod
@@ -287,6 +289,6 @@ class ExternalRows(PointRows):
         columns = 0, n - SIZE_WITHOUT_SLOW
         return np.pad(self._J, ((0, 0), (0, 0), columns)), self._J_constants
 
-    def whiten(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        out: Floats = rows * self._inverse_sigma[some, :, None]
+    def whiten(self, x: Floats, rows: slice = slice(None)) -> Floats:
+        out: Floats = x * self._inverse_sigma[rows, :, None]
         return out

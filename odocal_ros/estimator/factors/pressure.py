@@ -79,13 +79,13 @@ class PressureRows(ExternalRows):
         p_n = state.p_n[k] + state.v_n[k] * tau[:, None] + dp + g * (tau**2 / 2)[:, None]
         height = p_n[:, 2] + (p_n[:, :2]**2).sum(axis=1) / (2 * EARTH_RADIUS)
         raw = samples.height - height - by_constants @ state.constants[PRESSURE]
-        J, c = np.zeros((len(k), 1, SIZE_WITHOUT_SLOW)), np.zeros((len(k), 1, M))
+        J, J_c = np.zeros((len(k), 1, SIZE_WITHOUT_SLOW)), np.zeros((len(k), 1, M))
         up = np.concatenate([p_n[:, :2] / EARTH_RADIUS, np.ones((len(k), 1))], axis=1)[:, None]
         t = tau[:, None, None]
         J[:, :, P], J[:, :, V] = -up, -up * t - by_velocity
         J[:, :, PHI] = up @ skew(dp) + by_velocity @ skew(dv)
         J[:, :, BA] = up @ C @ points.AA + by_velocity @ C @ points.A
         by_gyro = -up @ C @ points.dp_by_gyro - by_velocity @ C @ points.dv_by_gyro
-        J[:, :, BG], c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
-        c[:, 0, PRESSURE] = -by_constants
-        return raw[:, None], J, c
+        J[:, :, BG], J_c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
+        J_c[:, 0, PRESSURE] = -by_constants
+        return raw[:, None], J, J_c

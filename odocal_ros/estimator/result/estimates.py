@@ -42,9 +42,9 @@ OPTIONAL = range(layout.ODO_ARM.start, layout.HEADING)
 def refused_result(reasons: Iterable[Reason], scale_unit: str,
                    wheels: Iterable[Travel] = ()) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
-    of_wheels = unknown_wheels((one.name for one in wheels), scale_unit)
-    return MethodResult('smoother', tuple(reasons), unknown_estimates(scale_unit) | of_wheels,
-                        PARAMETERS)
+    estimates = unknown_estimates(scale_unit) | unknown_wheels([w.name for w in wheels],
+                                                               scale_unit)
+    return MethodResult('smoother', tuple(reasons), estimates, PARAMETERS)
 
 
 def implausible_imu_reasons(fit: Fit) -> list[Reason]:
@@ -119,12 +119,12 @@ def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformatio
     """
     Return the marginal information of a fit at its last linearisation point, (S33).
 
-    The Schur complement of the constants minus their priors. It has no information on constants
-    that are fixed in the leg, or that other legs do not share.
+    It is the Schur complement of the constants minus the weights of their priors, and zero for
+    constants that are fixed in the leg, or that other legs do not share.
 
     setting_values : (M,) as ``configured_constants``.
     """
-    at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
+    constants, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
     reduced, g_reduced = fit.solved.reduced, fit.solved.g_reduced
     # LEG_CONSTANTS are eliminated, with their priors
     leg_rows = reduced[layout.LEG_CONSTANTS]
@@ -135,9 +135,9 @@ def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformatio
     free = priors.sigma > layout.NO_ERROR
     free[layout.LEG_CONSTANTS] = False
     return MarginalInformation(
-        layout.CONSTANTS, at + setting_values,
+        layout.CONSTANTS, constants + setting_values,
         (reduced - np.diag(weight)) * np.outer(free, free),
-        (g_reduced + weight * (at - priors.mean)) * free, priors.mean + setting_values,
+        (g_reduced + weight * (constants - priors.mean)) * free, priors.mean + setting_values,
         fit.initial_priors.sigma, priors.sigma).with_errors(
             fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data
 
@@ -148,11 +148,11 @@ def not_observable_reason(drives: str, names: list[str], local: bool) -> Reason:
 
     drives : subject, as text.   names : of estimates.   local : positions in a local frame.
     """
-    heights = all(name.endswith('_z') for name in names)
+    remedy = ('Measure these heights and set them. Even a drive with turns and stops hardly '
+              'determines them.' if all(name.endswith('_z') for name in names) else '')
     return Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on {drives}: '
                   f'{name_antenna(join_names(names), local)}; the configured values are used',
-                  'Measure these heights and set them. Even a drive with turns and stops hardly '
-                  'determines them.' if heights else '')
+                  remedy)
 
 
 def join_names(names: Iterable[str]) -> str:

@@ -56,19 +56,19 @@ REMEDIES = {
                 'drive wider turns.',
     'heights': 'Check the unit of heights in the fix driver.',
     'distances': 'Check unit and scale of the positions, such as of a map or a single camera.',
-    'heading_fixed': (
+    'configured_heading': (
         "Check alignment.heading: it is the heading of the IMU's x axis, clockwise from true "
         'north.'),
-    'heading_sent': 'Check that this heading is an ENU yaw relative to true north. Magnetic '
-                    'headings err by several degrees near steel: then use another source.'}
+    'published_heading': 'Check that this heading is an ENU yaw relative to true north. Magnetic '
+                         'headings err by several degrees near steel: then use another source.'}
 
 
 def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
     """Return the factor on all sigmas, at least 1, and reasons."""
     level = fit.levels.sigmas()
-    excess, noise_texts, remedy = _noise_over_grade(problem, level, config)
+    noise_ratio, noise_texts, remedy = _noise_over_grade(problem, level, config)
     # vibration is not white, and its spectrum is unknown
-    is_noisy = excess > MAX_RATIO_TO_GRADE
+    is_noisy = noise_ratio > MAX_RATIO_TO_GRADE
     texts = noise_texts + _biases_over_grade(problem, fit, config)
     reasons = [Reason(
         Code.IMU_WORSE_THAN_GRADE, f'{" and ".join(texts)} times that of the {config.imu.grade} '
@@ -78,8 +78,8 @@ def find_mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, li
     reasons += _accelerometer_outlier_reasons(fit)
     contradictions, step = _convergence_texts(fit)
     if is_noisy and not texts:
-        contradictions[f'IMU noise is {differing(excess, MAX_RATIO_TO_GRADE)} times that of its '
-                       f'grade (limit {MAX_RATIO_TO_GRADE:g}) and may not be white'] = remedy
+        contradictions[f'IMU noise is {differing(noise_ratio, MAX_RATIO_TO_GRADE)} times that of '
+                       f'its grade (limit {MAX_RATIO_TO_GRADE:g}) and may not be white'] = remedy
     contradictions |= _level_texts(problem, fit, level)
     reasons += _heading_reasons(problem.external.get('heading'),
                                 float(fit.state.constants[HEADING]))
@@ -141,14 +141,13 @@ def _convergence_texts(fit: Fit) -> tuple[dict[str, str], float]:
 def _level_texts(problem: Problem, fit: Fit, level: dict[str, float]) -> dict[str, str]:
     """Return texts and remedies of outliers, slip, sideslip and height errors beyond limits."""
     texts = {}
-    for what, mask, remedy in (
-            ('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5,
-             REMEDIES['fixes']),
-            ('of the time the wheel slips', fit.variance_factors[:, 0] > SLIP_VARIANCE,
-             REMEDIES['slip'])):
+    for subject, mask, remedy in (
+            ('fixes that are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5, 'fixes'),
+            ('time with wheel slip', fit.variance_factors[:, 0] > SLIP_VARIANCE, 'slip')):
         share = float(mask.mean())
         if share > OUTLIER_SHARE_LIMIT:
-            texts[f'{100 * share:.0f} % {what} (limit {100 * OUTLIER_SHARE_LIMIT:.0f} %)'] = remedy
+            texts[f'{subject}: {100 * share:.0f} % (limit {100 * OUTLIER_SHARE_LIMIT:.0f} %)'
+                  ] = REMEDIES[remedy]
     sideslip = max(level['side'], level['side_turn'])
     if sideslip > SIDESLIP_LIMIT:
         texts[f'sideslip at the odometer is {sideslip:.2f} m/√s (limit '
@@ -194,60 +193,56 @@ def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reas
                    f'{np.rad2deg(error):+z.2f} deg ({sigmas:.1f} sigma; limit '
                    f'{REMARK_SIGMAS:g}) from the heading estimated on this drive; it was '
                    'down-weighted',
-                   REMEDIES['heading_fixed' if heading.source_name == 'fixed' else
-                            'heading_sent'])]
+                   REMEDIES['configured_heading' if heading.source_name == 'fixed' else
+                            'published_heading'])]
 
 
-def find_noise_cause(problem: Problem, level: dict[str, float], worse: list[str]) -> str:
+def find_noise_cause(problem: Problem, level: dict[str, float], noisy: list[str]) -> str:
     """
     Return the cause of a noise that exceeds its grade, with the evidence, and the action.
 
-    level : white noise of 'gyro' and 'accel', SI per sqrt(Hz).   worse : which of them exceed
+    level : white noise of 'gyro' and 'accel', SI per sqrt(Hz).   noisy : which of them exceed
     their grade; empty: no text.
     """
-    if not worse:
+    if not noisy:
         return ''
     quantised = {name: step for name, step in find_quantisation_steps(problem.leg, level).items()
-              if name in worse}
-    vibrating: dict[str, str] = {}
-    sensor_noise_names: list[str] = []
-    unknown: list[str] = []
+                 if name in noisy}
+    vibrating, texts = dict[str, str](), list[str]()
     in_motion, at_rest = sample_noise_by_motion(problem)
-    for name in (name for name in worse if name not in quantised):
-        rest, motion = at_rest.get(name, 0.0), in_motion.get(name, 0.0)
+    for name in (name for name in noisy if name not in quantised):
+        rest, motion, sensor = at_rest.get(name, 0.0), in_motion.get(name, 0.0), NAMES[name]
+        if_normal = (f'If this is normal for this {sensor}, set imu.{name}_noise to '
+                     f'{level[name]:.2g} ({UNITS[name]}).')
         if rest and motion > MAX_MOTION_RATIO * rest:
-            vibrating[name] = (f'{NAMES[name]} samples vary {motion / rest:.0f} times as much '
+            vibrating[name] = (f'{sensor} samples vary {motion / rest:.0f} times as much '
                                'in motion as at rest')
         elif not rest and motion > MAX_MOTION_RATIO * level[name]:
-            vibrating[name] = (f'{NAMES[name]} samples vary {motion / level[name]:.0f} times as '
+            vibrating[name] = (f'{sensor} samples vary {motion / level[name]:.0f} times as '
                                'much as their means over seconds')
+        elif MAX_MOTION_RATIO * rest > level[name]:
+            texts.append(f'The {sensor} noise does not come from vibration: at rest it is '
+                         f'similar. {if_normal}')
         else:
-            (sensor_noise_names if MAX_MOTION_RATIO * rest > level[name] else unknown).append(name)
-    texts = []
-    if quantised:
-        texts.append(f'{_cause_of(quantised, worse)} is quantisation: '
-                     f'{_steps_in_words(quantised)}. Set a finer resolution or a smaller range in '
-                     'the IMU or its driver, if there is one.')
+            reason = ('single samples vary less than their means over seconds' if at_rest else
+                      'there is no standstill to compare with')
+            texts.append(f'The cause of the {sensor} noise is unknown: {reason}. Mount the IMU '
+                         f'firmly. {if_normal}')
     if vibrating:
-        texts.append(f'{_cause_of(vibrating, worse)} is vibration: '
+        texts.insert(0, f'{_cause_of(vibrating, noisy)} is vibration: '
                      f'{", ".join(vibrating.values())}. Mount the IMU firmly and away from '
                      'engine and motors.')
-    texts += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
-              f'this is normal for this {NAMES[name]}, {_setting(name, level)}'
-              for name in sensor_noise_names]
-    texts += [f'The cause of the {NAMES[name]} noise is unknown: ' + (
-        'single samples vary less than their means over seconds. ' if at_rest else
-        'there is no standstill to compare with. ')
-        + f'Mount the IMU firmly. If this is normal for this {NAMES[name]}, '
-        f'{_setting(name, level)}'
-        for name in unknown]
+    if quantised:
+        texts.insert(0, f'{_cause_of(quantised, noisy)} is quantisation: '
+                     f'{_steps_in_words(quantised)}. Set a finer resolution or a smaller range in '
+                     'the IMU or its driver, if there is one.')
     return ' '.join(texts)
 
 
-def _cause_of(names: Collection[str], worse: Collection[str]) -> str:
+def _cause_of(names: Collection[str], noisy: Collection[str]) -> str:
     """Return the subject of a cause, with the sensors if others have another cause."""
     sensors = ' and '.join(NAMES[name] for name in names)
-    return 'The cause' + f' of the {sensors} noise' * (len(names) < len(worse))
+    return 'The cause' + f' of the {sensors} noise' * (len(names) < len(noisy))
 
 
 def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
@@ -266,10 +261,6 @@ def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str
     in_motion, at_rest = (np.flatnonzero(kinds == kind)[:MAX_NOISE_SAMPLES] for kind in (0, 1))
     return (sample_noise(leg, in_motion) if len(in_motion) >= MIN_NOISE_SAMPLES else {},
             sample_noise(leg, at_rest) if len(at_rest) >= MIN_NOISE_SAMPLES else {})
-
-
-def _setting(name: str, level: dict[str, float]) -> str:
-    return f'set imu.{name}_noise to {level[name]:.2g} ({UNITS[name]}).'
 
 
 def _steps_in_words(steps: dict[str, float]) -> str:

@@ -42,14 +42,13 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, marginals: Jo
     Biases at the start of the leg in b, m/s^2. factor : on the sigmas of the fit.
     """
     motion = fit.weighted[MotionRows].motion
-    path = np.linalg.norm(motion.displacement, axis=1)
     moving = ~problem.at_rest[:-1] & ~problem.at_rest[1:]
     moving = moving if moving.any() else ~moving
-    speed = (path / motion.T[:, 0])[moving]
+    speed = (np.linalg.norm(motion.displacement, axis=1) / motion.T[:, 0])[moving]
     rate = motion.turning[moving]
     t, coarse = leg.travel.t, leg.travel.coarse
     within = (t >= leg.t_begin) & (t <= leg.t_stop)
-    # the lower limit, which a reading without quantisation has, is no error of a reading
+    # the lower limit of the level, which a reading without quantisation has, is no error
     no_error = 0.0 if leg.travel.quantum else problem.min_levels['travel']
     odometer = {
         'reading': float(np.sqrt(max(fit.levels['travel'] - no_error, 0.0))),
@@ -86,9 +85,8 @@ def factor_as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[s
         return {}
     by_offset = float(dt[speed > 0].sum() / (dt @ speed))       # t / s
     ratio = 1 + by_offset * state.constants[SPEED_OFFSET]
-    gradient = np.array([1.0, by_offset / ratio])
-    at = [LN_K, SPEED_OFFSET]
-    relative = float(np.sqrt(gradient @ covariance[np.ix_(at, at)] @ gradient))
+    gradient, rows = np.array([1.0, by_offset / ratio]), [LN_K, SPEED_OFFSET]
+    relative = float(np.sqrt(gradient @ covariance[np.ix_(rows, rows)] @ gradient))
     value = state.scale * ratio
     return {AS_SENT: Estimate(value, value * relative, leg.scale_unit)}
 
@@ -113,15 +111,12 @@ def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -
         for i, unit in ((layout.SCALE_BY_SPEED, '1/(m/s)'), (layout.SCALE_BY_TIME, '1/s'))}
     if grade is not None:
         for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):
-            out[f'{name}_mounting_angle_housing_sigma'] = _entry(_housing_sigma(
-                value[axis], sigma[axis], sigma[angle], grade.misalignment_sigma), 'rad')
+            out[f'{name}_mounting_angle_housing_sigma'] = {'value': _housing_sigma(
+                value[axis], float(sigma[axis]), float(sigma[angle]), grade.misalignment_sigma),
+                'sigma': None, 'unit': 'rad'}
     next_drive = 1e-3       # physical: 1 sigma of the scale between drives, tyres warm or cold
-    out['scale_ratio_next_drive_sigma'] = _entry(np.hypot(sigma[layout.LN_K], next_drive), '1')
-    return out
-
-
-def _entry(value: float, unit: str) -> dict[str, Any]:
-    return {'value': float(value), 'sigma': None, 'unit': unit}
+    return out | {'scale_ratio_next_drive_sigma': {
+        'value': float(np.hypot(sigma[layout.LN_K], next_drive)), 'sigma': None, 'unit': '1'}}
 
 
 def _housing_sigma(error: float, error_sigma: float, sigma: float, misalignment: float) -> float:
@@ -135,13 +130,13 @@ def _housing_sigma(error: float, error_sigma: float, sigma: float, misalignment:
 
 def level_pitch(fit: Fit, marginals: JointMarginals, factor: float) -> dict[str, Any]:
     """Return the pitch mounting relative to the level of the accelerometer with its bias."""
-    k = len(marginals) // 2
-    n = fit.solved.step.shape[1]
-    at = np.array([2 * n + layout.PITCH, layout.BA.start])
-    C = marginals[k][np.ix_(at, at)]
-    row = np.array([1.0, -1 / G])
-    return {'value': float(row @ [fit.state.constants[layout.PITCH], fit.state.accel_bias[k, 0]]),
-            'sigma': float(np.sqrt(row @ C @ row) * factor), 'unit': 'rad'}
+    k, n = len(marginals) // 2, fit.solved.step.shape[1]
+    rows = np.array([2 * n + layout.PITCH, layout.BA.start])
+    C = marginals[k][np.ix_(rows, rows)]
+    gradient = np.array([1.0, -1 / G])
+    return {'value': float(gradient @ [fit.state.constants[layout.PITCH],
+                                       fit.state.accel_bias[k, 0]]),
+            'sigma': float(np.sqrt(gradient @ C @ gradient) * factor), 'unit': 'rad'}
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +144,8 @@ class TwistNoise:
     """Errors of the twist (speed and turn rate) that calibrated wheels give for each message."""
 
     period: float                     # s, between messages
-    speed: float                      # m/s, rms of the drive in motion
-    turn_rate: float                  # rad/s, rms
+    speed: float                      # m/s, rms in motion
+    turn_rate: float                  # rad/s, rms in motion
     fastest: tuple[float, float]      # highest speed, m/s, and turn rate, rad/s
     legs: tuple[dict[str, Any], ...]  # details of the fit of each leg
     estimates: dict[str, Estimate]    # of the calibration
@@ -159,7 +154,8 @@ class TwistNoise:
     def has_turn_rate(self) -> bool:
         """Return True if two wheels give the turn rate."""
         return all(f'scale_factor_{side}' in self.estimates for side in SIDES) and bool(
-            self._known('track_width')[0]) and all('left' in leg['wheels'] for leg in self.legs)
+            self._estimate('track_width')[0]) and all(
+                'left' in leg['wheels'] for leg in self.legs)
 
     def variances(self, speed: float, turn_rate: float) -> Floats:
         """
@@ -173,14 +169,15 @@ class TwistNoise:
         return mean
 
     def _leg_variances(self, leg: dict[str, Any], v: float, w: float) -> Floats:
+        """Return ``variances`` by one leg; v, w : speed, m/s, turn rate, rad/s, both absolute."""
         noise, odometer, T = leg['noise'], leg['odometer'], self.period
-        K = self._known('scale_factor')[0]
-        factor = self._known(AS_SENT)[0] or K
+        K = self._estimate('scale_factor')[0]
+        factor = self._estimate(AS_SENT)[0] or K
         # as in interval_noise.py: noise is proportional to the time, below 1 m/s to the path
         per_level = min(max(v, 0.02), 1.0) / T      # 1/s, variance of a mean speed over its level
-        hard = odometer['hard']                     # share of the time with acceleration
+        accelerating = odometer['hard']             # share of the time
         reading = (K * odometer['reading'])**2 / T**2       # of one reading; an interval has two
-        along = (1 - hard) * noise['along']**2 + hard * noise['along_hard']**2
+        along = (1 - accelerating) * noise['along']**2 + accelerating * noise['along_hard']**2
         sway_per_level = per_level * T / max(T, SWAY_TIME)
         steps = noise.get('steps')
         if steps is not None:     # the fit does not use the integral of such a speed
@@ -189,7 +186,7 @@ class TwistNoise:
         white = leg['widened']**2 * np.array(
             [along * per_level + 2 * reading, side * sway_per_level,
              noise['up']**2 * sway_per_level])
-        arm_x, arm_y = (np.square(self._known(f'odometer_lever_arm_{axis}')).sum()
+        arm_x, arm_y = (np.square(self._estimate(f'odometer_lever_arm_{axis}')).sum()
                         for axis in 'xy')
         by_sideslip = _mean_square(leg['sideslip']) * (v**2 * w)**2
         constant = np.array([self._scale_variance(leg, v) + arm_y * w**2,
@@ -201,7 +198,7 @@ class TwistNoise:
 
     def _scale_variance(self, leg: dict[str, Any], v: float) -> float:
         """Return the variance of the speed by the scale: its sigma and its change with speed."""
-        scale, sigma = self._known('scale_factor')
+        scale, sigma = self._estimate('scale_factor')
         by_speed = _mean_square(leg['scale_by_speed'])
         change = (v**2 - leg['odometer']['square_speed']) / (2 * FAST_SPEED)
         return float(v**2 * ((sigma / scale)**2 + by_speed * change**2))
@@ -212,17 +209,16 @@ class TwistNoise:
         if not self.has_turn_rate:
             return np.nan
         left, right = (leg['wheels'][side] for side in SIDES)
-        (width, sigma), hard = self._known('track_width'), leg['odometer']['hard']
-        constant, accelerating, turning = (np.square(left['walk'])
-                                           + np.square(right['walk'])) / 2
-        walk = turning if w > TURNING_RATE else (1 - hard) * constant + hard * accelerating
+        (width, sigma), share = self._estimate('track_width'), leg['odometer']['hard']
+        constant, accelerating, turning = (np.square(left['walk']) + np.square(right['walk'])) / 2
+        walk = turning if w > TURNING_RATE else (1 - share) * constant + share * accelerating
         # the mean of two wheels has half the variance of one; their deviations from the mean have
         # opposite signs
         white = leg['widened']**2 * (4 * walk * per_level + 8 * reading)
         ratio = left['ratio_sigma'] + right['ratio_sigma']
         return float(white + (sigma * w)**2 + (ratio * v)**2) / width**2
 
-    def _known(self, name: str) -> tuple[float, float]:
+    def _estimate(self, name: str) -> tuple[float, float]:
         """Return value and sigma of an estimate, 0 if it is not determined."""
         estimate = self.estimates.get(name)
         return (estimate.value or 0.0, estimate.sigma or 0.0) if estimate else (0.0, 0.0)

@@ -56,7 +56,7 @@ IMPERFECTION_CONSTANTS = range(layout.FIX_MOTION_TIME, layout.VELOCITY.start)
 class _Posterior:
     """Uncertainty of the constants after the fit, with the errors of the model, (S31)."""
 
-    factor: float        # f of (S31), on the sigmas of the fit
+    factor: float        # f of (S31), which multiplies the sigmas of the fit
     covariance: Floats   # (M, M)
     sigma: Floats        # (M,)
     sigma_ratio: Floats  # (M,) sigma of the fit over that of the prior
@@ -68,21 +68,24 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     marginals = fit.solved.marginals()
     factor, reasons = find_mismatch(problem, fit, config)
     # only the steps of a coarse speed are used, which do not show slip
-    slip_path = None if leg.uses_speed_steps else residuals.odometer_minus_ground_path(
-        fit, marginals)
-    slips, unexplained = ((), None) if slip_path is None else (
-        residuals.find_slips(fit, slip_path, leg.travel.quantum * fit.state.scale),
-        residuals.find_unexplained_travel(fit, slip_path))
+    slips: tuple[residuals.Slip, ...] = ()
+    unexplained = None
+    if not leg.uses_speed_steps:
+        slip_path = residuals.odometer_minus_ground_path(fit, marginals)
+        slips = residuals.find_slips(fit, slip_path, leg.travel.quantum * fit.state.scale)
+        unexplained = residuals.find_unexplained_travel(fit, slip_path)
     posterior = _posterior(problem, fit, factor, slips, unexplained)
     sigma, grade = posterior.sigma, problem.grade if leg.has_accelerometer else None
     reasons += [unexplained.reason()] if unexplained else []
     reasons += _slip_reasons(leg, fit, marginals, slips, sigma)
     reasons += remarks.remarks(problem, fit, sigma, posterior.sigma_ratio, config)
     estimates, refusals = _estimate(leg, fit, posterior, config)
-    wheels, of_wheels, wheel_reasons = _estimate_wheels(
-        problem, fit, marginals, posterior, estimates['scale_factor'], config)
+    wheels = _fit_wheels(problem, fit, marginals, posterior, config)
+    additional, wheel_reasons = wheel_estimates(
+        [wheel.name for wheel in leg.wheels], wheels, estimates['scale_factor'],
+        config) if leg.wheels else ({}, [])
     gyro_bias, bias_ratio = _estimate_gyro_bias(fit, marginals, factor)
-    estimates |= of_wheels | gyro_bias
+    estimates |= additional | gyro_bias
     ratio = {layout.CONSTANTS[i]: float(posterior.sigma_ratio[i])
              for i in (*OPTIONAL, *IMPERFECTION_CONSTANTS)} | bias_ratio
     reasons += [*refusals, *wheel_reasons,
@@ -107,12 +110,14 @@ def _posterior(problem: Problem, fit: Fit, factor: float, slips: tuple[residuals
                unexplained: residuals.UnexplainedTravel | None) -> _Posterior:
     """Return covariance and sigmas of the constants, the errors beyond the fit included."""
     covariance = with_model_floor(fit.covariance * factor**2)
-    of_travel = {
-        'slip': abs(sum(slip.metres for slip in slips)) / residuals.path_length(fit) if slips
-        else 0.0,
-        'unexplained_travel': unexplained.share if unexplained else 0.0}
+    travel_errors = {}
+    if slips:
+        slip = abs(sum(slip.metres for slip in slips))
+        travel_errors['slip'] = slip / residuals.path_length(fit)
+    if unexplained:
+        travel_errors['unexplained_travel'] = unexplained.share
     beyond_fit = remarks.find_errors_beyond_fit(problem, fit, np.sqrt(np.diag(covariance)),
-                                                of_travel)
+                                                travel_errors)
     for error in beyond_fit:
         covariance[error.constant, error.constant] += error.sigma**2
     return _Posterior(factor, covariance, np.sqrt(np.diag(covariance)),
@@ -132,17 +137,12 @@ def _estimate(leg: SmootherLeg, fit: Fit, posterior: _Posterior,
     return estimates, reasons
 
 
-def _estimate_wheels(problem: Problem, fit: Fit, marginals: JointMarginals, posterior: _Posterior,
-                     scale: Estimate, config: Config,
-                     ) -> tuple[dict[str, Wheel], dict[str, Estimate], list[Reason]]:
-    """Return the wheels relative to their mean, their estimates, and reasons."""
+def _fit_wheels(problem: Problem, fit: Fit, marginals: JointMarginals, posterior: _Posterior,
+                config: Config) -> dict[str, Wheel]:
+    """Return the wheels relative to their mean, by name."""
     up_b = fit.state.C_bv[:, 2]
     drift = float(np.sqrt(up_b @ marginals[0][layout.BG, layout.BG] @ up_b) * posterior.factor)
-    wheels = fit_wheels(problem, fit, posterior.covariance, drift, config.odometer.track_width)
-    if not problem.leg.wheels:
-        return wheels, {}, []
-    names = [wheel.name for wheel in problem.leg.wheels]
-    return wheels, *wheel_estimates(names, wheels, scale, config)
+    return fit_wheels(problem, fit, posterior.covariance, drift, config.odometer.track_width)
 
 
 def _estimate_gyro_bias(fit: Fit, marginals: JointMarginals,
@@ -197,7 +197,7 @@ def _slip_reasons(leg: SmootherLeg, fit: Fit, marginals: JointMarginals,
     # a filter of unknown shape, or a late or held speed, also has errors at changes of speed
     level = '' if filtered or (sign > 0).any() else residuals.describe_slip_level(
         fit, marginals, leg.travel.quantum * fit.state.scale)
-    wheel_slips = tuple(slip for slip, is_other in zip(slips, sign, strict=True) if not is_other)
+    wheel_slips = tuple(slip for slip, s in zip(slips, sign, strict=True) if s == 0)
     return [*filtered, *residuals.slip_reasons(wheel_slips, level), *travel_reasons(
         np.array([s.t for s in slips]), np.array([s.metres for s in slips]), sign)]
 
@@ -255,13 +255,14 @@ def _external_details(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, di
 
 
 def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
-    """Return the error sources of ln K, yaw and pitch, (S32); the remainder is by standstills."""
+    """Return the error sources of ln K, yaw and pitch, (S32); the rest is that of standstills."""
     solved = fit.solved.covariance
     covariance: dict[str, np.ndarray] = {}
     for factor in fit.weighted.factors.values():
         for name, effects in factor.effects(marginals):
-            flat = np.moveaxis(effects, -2, 0).reshape(PARAMETER_COUNT, -1)
-            covariance[name] = covariance.get(name, 0.0) + flat @ flat.T
+            # (..., 3, k) to (3, all unit errors)
+            columns = np.moveaxis(effects, -2, 0).reshape(PARAMETER_COUNT, -1)
+            covariance[name] = covariance.get(name, 0.0) + columns @ columns.T
     shared = [Source(name, effects, True)
               for name, effects in fit.weighted[PriorRows].shared_effects(solved)]
     rest = solved[:PARAMETER_COUNT, :PARAMETER_COUNT] - sum(covariance.values()) - sum(

@@ -53,25 +53,22 @@ POSE_OUTLIER_REMEDY = (
     'Check the map and the source of positions for jumps. The comparison of track and fixes '
     'includes these positions.')
 LEVER_ARM_AXES = 'Axes: from base_link, x forward, y left, z up.'
-OTHER_CAUSE = {     # of a lever arm that deviates, by whether the axis is z
-    False: 'Slip in turns (skid steering, tracks) also shifts x and y; if that is the cause, keep '
-           'the setting.',
-    True: 'Body roll on soft springs also shifts z; if that is the cause, keep the setting.'}
-IMU_ARM = {     # by whether imu.lever_arm is set
-    False: 'An imu.lever_arm that is not set has the same effect: set it first.',
-    True: 'A wrong imu.lever_arm has the same effect: check it too.'}
+CAUSES_OF_ARM_SHIFT = {     # other causes of a deviating lever arm, by its axes
+    'xy': 'Slip in turns (skid steering, tracks) also shifts x and y; if that is the cause, keep '
+          'the setting.',
+    'z': 'Body roll on soft springs also shifts z; if that is the cause, keep the setting.'}
 
 
-def sigma_by_wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
-    """Return the sigma of ln K if the positions, in a local frame, contain the wheels, else 0."""
-    share = c[layout.FIX_BY_MOTION]
+def map_scale_sigma(problem: Problem, c: Floats, sigma: Floats) -> float:
+    """Return the sigma of ln K if positions in a local frame contain wheel odometry, else 0."""
+    scale_error = c[layout.FIX_BY_MOTION]
     if not (problem.leg.origin.is_local
-            and contains_odometer(share, sigma[layout.FIX_BY_MOTION])):
+            and contains_odometer(scale_error, sigma[layout.FIX_BY_MOTION])):
         return 0.0
     # the map's drift is filtered together with the wheels: within a time constant of the filter
     # it looks like the wheel error, so that there are duration / time constant samples
     duration = problem.leg.t_stop - problem.leg.t_begin
-    return float(abs(share) * np.sqrt(np.exp(c[layout.FIX_MOTION_TIME]) / duration))
+    return float(abs(scale_error) * np.sqrt(np.exp(c[layout.FIX_MOTION_TIME]) / duration))
 
 
 class ErrorBeyondFit(NamedTuple):
@@ -83,33 +80,30 @@ class ErrorBeyondFit(NamedTuple):
 
 
 def find_errors_beyond_fit(problem: Problem, fit: Fit, sigma: Floats,
-                           of_travel: dict[str, float]) -> list[ErrorBeyondFit]:
-    """Return errors; sigma : (M,) of the constants.   of_travel : of ln K, by source."""
-    by_map = sigma_by_wheels_in_map(problem, fit.state.constants, sigma)
+                           travel_errors: dict[str, float]) -> list[ErrorBeyondFit]:
+    """Return errors; sigma : (M,) of the constants.   travel_errors : of ln K, by source."""
     has_height = problem.leg.origin.is_local or not np.isnan(problem.leg.fixes_n[:, 2]).all()
-    by_height = 0.0 if has_height else HEIGHT_UNKNOWN / SEMI_MAJOR_AXIS
-    # which of the two values a later drive has is unknown
-    of_angles = [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size)) for step in
+    scale_errors = travel_errors | {
+        'wheels_in_positions': map_scale_sigma(problem, fit.state.constants, sigma),
+        'height': 0.0 if has_height else HEIGHT_UNKNOWN / SEMI_MAJOR_AXIS}
+    # of an angle that changes, a later drive may have either value
+    return [ErrorBeyondFit(layout.LN_K, name, size) for name, size in scale_errors.items() if size
+            ] + [ErrorBeyondFit(step.constant, 'change_of_mounting', abs(step.size)) for step in
                  fit.constant_steps if step.constant != layout.LN_K and step.is_certain]
-    of_scale = of_travel | {'wheels_in_positions': by_map, 'height': by_height}
-    return [ErrorBeyondFit(layout.LN_K, name, size)
-            for name, size in of_scale.items() if size] + of_angles
 
 
-def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
+def remarks(problem: Problem, fit: Fit, sigma: Floats, sigma_ratio: Floats,
             config: Config) -> list[Reason]:
-    """Return reasons; sigma : (M,) of the constants.   ratio : (M,) of it to the prior sigma."""
-    c = fit.state.constants
-    reasons = [*_noise_reasons(problem, fit.levels), *_outlier_reasons(problem, fit),
-               *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
-               *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
-                                 c[layout.FIX_MOTION_TIME],
-                                 sigma_by_wheels_in_map(problem, c, sigma)),
-               *(reason for name, i in CLOCKS.items()
-               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
-               *_scale_variation_reasons(fit, sigma), *_change_reasons(fit),
-               *_bias_step_reasons(fit)]
-    return reasons + _imu_reasons(c, sigma, config) + _lever_arm_reasons(c, sigma, ratio, config)
+    """Return reasons; sigma, sigma_ratio : (M,) of the constants, and over the prior sigma."""
+    c, duration = fit.state.constants, float(np.ptp(fit.state.t))
+    return [*_noise_reasons(problem, fit.levels), *_outlier_reasons(problem, fit),
+            *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
+            *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
+                              c[layout.FIX_MOTION_TIME], map_scale_sigma(problem, c, sigma)),
+            *(reason for name, i in CLOCKS.items()
+              for reason in clock_reasons(name, c[i], sigma[i], duration)),
+            *_scale_variation_reasons(fit, sigma), *_change_reasons(fit), *_bias_step_reasons(fit),
+            *_imu_reasons(c, sigma, config), *_lever_arm_reasons(c, sigma, sigma_ratio, config)]
 
 
 def _imu_reasons(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
@@ -165,18 +159,17 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
 
 def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
-    motion, c = fit.weighted[MotionRows].motion, fit.state.constants
-    texts = []
-    for i, signal, what in ((layout.SCALE_BY_SPEED, 0, 'from low to high speed'),
-                            (layout.SCALE_BY_TIME, 1, 'from start to end')):
-        change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(motion.tyre_signals[:, signal])
+    signals, texts, remedy = fit.weighted[MotionRows].motion.tyre_signals, list[str](), ''
+    for i, interval in ((layout.SCALE_BY_SPEED, 'from low to high speed'),
+                        (layout.SCALE_BY_TIME, 'from start to end')):
+        change, change_sigma = np.array([fit.state.constants[i], sigma[i]]) * np.ptp(
+            signals[:, i - layout.TYRES.start])
         if abs(change) > max(REMARK_SIGMAS * change_sigma, MIN_REPORTED_CHANGE):
-            texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {what}')
-    if not texts:
-        return []
-    less = texts[0].startswith('-') and 'speed' in texts[0]
+            texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {interval}')
+            if i == layout.SCALE_BY_SPEED and change < 0:
+                remedy = SPEED_SCALE_REMEDY
     return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(texts)}; the stated '
-                   'value is the mean over this leg', SPEED_SCALE_REMEDY if less else '')]
+                   'value is the mean over this leg', remedy)] if texts else []
 
 
 def _bias_step_reasons(fit: Fit) -> list[Reason]:
@@ -200,10 +193,10 @@ def _change_reasons(fit: Fit) -> list[Reason]:
     texts = []
     for step in fit.constant_steps:
         if step.is_certain and abs(step.size) > MIN_REPORTED_CHANGE:
-            what = layout.CONSTANTS[step.constant].replace('_', ' ')
+            name = layout.CONSTANTS[step.constant].replace('_', ' ')
             size = f'{100 * step.size:+z.2f} %' if step.constant == layout.LN_K else \
                 f'{np.rad2deg(step.size):+z.2f} deg'
-            texts.append(f'the {what} changes by about {size} near t = {step.t:.0f} s '
+            texts.append(f'the {name} changes by about {size} near t = {step.t:.0f} s '
                          f'({abs(step.size) / step.sigma:.0f} sigma)')
     return [Reason(Code.CHANGE_IN_LEG, '; '.join(texts))] if texts else []
 
@@ -216,7 +209,8 @@ def deviating_lever_arms(c: Floats, sigma: Floats) -> set[int]:
     return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], min_size)}
 
 
-def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reason]:
+def _lever_arm_reasons(c: Floats, sigma: Floats, sigma_ratio: Floats,
+                       config: Config) -> list[Reason]:
     """Return LEVER_ARM_OFF for the lever arms whose estimates deviate from their settings."""
     texts, axes_of = [], defaultdict[tuple[str, str], list[str]](list)
     deviating = deviating_lever_arms(c, sigma)
@@ -229,7 +223,7 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
             estimated = value + c[i]
             text = f'{estimated:+z.2f} ± {sigma[i]:.2f} m'
             # not among the estimates
-            rough = ' (too uncertain for a result)' * bool(ratio[i] >= INFORMED_SHARE)
+            rough = ' (too uncertain for a result)' * bool(sigma_ratio[i] >= INFORMED_SHARE)
             if abs(estimated) > reach:
                 texts.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
                 action = 'Ignore the estimate of {}: another error causes it.'
@@ -242,12 +236,15 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, ratio: Floats, config: Config) 
             axes_of[action, name].append(axis)
     actions = [action.format(f'{name} ({", ".join(axes)})')
                for (action, name), axes in axes_of.items()]
-    is_z = {axis == 'z' for (action, _), axes in axes_of.items() if 'easure' in action
-            for axis in axes}
-    if is_z:
-        actions += [LEVER_ARM_AXES, IMU_ARM[any(config.imu.lever_arm)],
-                    *(OTHER_CAUSE[key] for key in sorted(is_z))]
-    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}. The other values are for '
+    to_measure = {axis for (action, _), axes in axes_of.items() if 'Measure' in action
+                  for axis in axes}
+    if to_measure:
+        actions += [LEVER_ARM_AXES, 'A wrong imu.lever_arm has the same effect: check it too.'
+                    if any(config.imu.lever_arm) else
+                    'An imu.lever_arm that is not set has the same effect: set it first.',
+                    *(cause for axes, cause in CAUSES_OF_ARM_SHIFT.items()
+                      if to_measure & set(axes))]
+    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}. The other values assume '
                    'the estimated position', ' '.join(actions))] if texts else []
 
 
@@ -256,28 +253,28 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
     min_size = 0.1     # s: the age of a fix at 10 Hz is up to this
     if abs(square) <= max(REMARK_SIGMAS * sigma, min_size**2):
         return ()
-    what, time = ('fixes are averaged', np.sqrt(square)) if square > 0 else (
+    process, time = ('fixes are averaged', np.sqrt(square)) if square > 0 else (
         'positions and velocities of the fixes are filtered', np.sqrt(-square / 2))
-    return (Reason(Code.FIXES_SMOOTHED, f'{what} with a time constant of about '
+    return (Reason(Code.FIXES_SMOOTHED, f'{process} with a time constant of about '
                    f'{time:.2f} s; accounted for'),)
 
 
-def contains_odometer(share: float, sigma: float) -> bool:
+def contains_odometer(scale_error: float, sigma: float) -> bool:
     """Return True if the positions contain an odometer, with this scale error and its sigma."""
     min_size = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
-    return bool(abs(share) > max(FAULT_SIGMAS * sigma, min_size))
+    return bool(abs(scale_error) > max(FAULT_SIGMAS * sigma, min_size))
 
 
-def odometer_reasons(share: float, sigma: float, log_time: float,
-                     by_map: float) -> tuple[Reason, ...]:
-    """Return FIXES_FOLLOW_ODOMETER if significant; by_map: sigma of ln K, 0 without a map."""
-    if not contains_odometer(share, sigma):
+def odometer_reasons(scale_error: float, sigma: float, log_time: float,
+                     map_sigma: float) -> tuple[Reason, ...]:
+    """Return FIXES_FOLLOW_ODOMETER if significant; map_sigma : of ln K, 0 without a map."""
+    if not contains_odometer(scale_error, sigma):
         return ()
-    return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
-                   f'of {100 * share:+z.2f} % ± {100 * sigma:.2f} % (time constant '
-                   f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; '
-                   'accounted for' + (f', with an uncertainty of the scale of {100 * by_map:.2g} %'
-                                      if by_map else '')),)
+    return (Reason(
+        Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
+        f'of {100 * scale_error:+z.2f} % ± {100 * sigma:.2f} % (time constant '
+        f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; accounted for'
+        + f', with an uncertainty of the scale of {100 * map_sigma:.2g} %' * bool(map_sigma)),)
 
 
 def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:

@@ -25,6 +25,7 @@ from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BA, BG, PHI, V
 from odocal_ros.nav.rotations import transpose
+from odocal_ros.nav.time_series import interpolated
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
@@ -57,9 +58,10 @@ def stored_residuals(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, 
     means in b, rad/s and m/s^2. ``residual_fix``, for each fix used, at ``residual_fix_t``, s:
     east, north, up, m, without the time-correlated error. Single precision, to save memory.
     """
-    rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
+    residuals = {**_interval_residuals(fit), 'fix': _fix_residuals(fit)}
     return {f'residual_{name}': np.concatenate(pair, axis=1).astype(np.float32)
-            for name, pair in rows.items()} | {'residual_fix_t': leg.t_fix[problem.used_fixes]}
+            for name, pair in residuals.items()
+            } | {'residual_fix_t': leg.t_fix[problem.used_fixes]}
 
 
 def correlation(t: Floats, residual: Floats) -> float:
@@ -86,29 +88,26 @@ def normalised_residuals(weighted: Weighted) -> dict[str, dict[str, float]]:
                             ('odometer', motion[:, D]), ('fixes, level', white[:, :2]))}
 
 
-def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
+def _interval_residuals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
     """Return residuals and sigmas of odometer, gyro and accelerometer: (K, 3) each."""
-    motion = fit.weighted[MotionRows]
-    parts_by_kind: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in INTERVAL_SENSORS}
-    T, C, C_end = (getattr(motion.motion, name) for name in ('T', 'C', 'C_end'))
-    for some in blocks(len(motion.r)):
-        root = np.linalg.inv(motion.whiten[some])
-        raw, Q = root @ motion.r[some, :, None], root @ np.swapaxes(root, 1, 2)
-        per_T = 1 / T[some, :, None]
-        for name, rows, axes in (('odometer', D, motion.noise.axes[some]),
-                                 ('gyro', PHI, transpose(C_end[some]) * per_T),
-                                 ('accelerometer', V, transpose(C[some]) * per_T)):
-            variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, rows, rows], axes)
-            parts_by_kind[name].append(((axes @ raw[:, rows])[:, :, 0], np.sqrt(variance)))
-    out = {name: (np.concatenate([value for value, _ in parts]),
-                  np.concatenate([sigma for _, sigma in parts]))
-           for name, parts in parts_by_kind.items()}
-    value, sigma = out['odometer']
-    absent = sigma**2 > ABSENT_VARIANCE / 2
-    return out | {'odometer': (np.where(absent, np.nan, value), np.where(absent, np.nan, sigma))}
+    rows = fit.weighted[MotionRows]
+    T, C, C_end = rows.motion.T, rows.motion.C, rows.motion.C_end
+    out = {name: np.empty((2, len(rows.r), 3)) for name in INTERVAL_SENSORS}
+    for chunk in blocks(len(rows.r)):
+        root = np.linalg.inv(rows.whiten[chunk])
+        raw, Q = root @ rows.r[chunk, :, None], root @ np.swapaxes(root, 1, 2)
+        per_T = 1 / T[chunk, :, None]
+        for name, row, axes in (('odometer', D, rows.noise.axes[chunk]),
+                                ('gyro', PHI, transpose(C_end[chunk]) * per_T),
+                                ('accelerometer', V, transpose(C[chunk]) * per_T)):
+            variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, row, row], axes)
+            out[name][:, chunk] = (axes @ raw[:, row])[:, :, 0], np.sqrt(variance)
+    absent = out['odometer'][1]**2 > ABSENT_VARIANCE / 2
+    out['odometer'][:, absent] = np.nan
+    return {name: (value, sigma) for name, (value, sigma) in out.items()}
 
 
-def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
+def _fix_residuals(fit: Fit) -> tuple[Floats, Floats]:
     """Return residuals and sigmas of the fixes: (m, 3) each."""
     fixes = fit.weighted[Fixes]
     covariance_root = np.linalg.inv(fixes.whitening)
@@ -140,8 +139,7 @@ def odometer_minus_ground_path(fit: Fit, marginals: JointMarginals) -> Floats:
 
 def find_slips(fit: Fit, slip_path: Floats, count_m: float) -> tuple[Slip, ...]:
     """Return the slips, largest first; slip_path : (K,) m.   count_m : size of a count, m."""
-    t = fit.state.t
-    limit = max(MIN_REPORTED_SLIP, count_m)
+    t, limit = fit.state.t, max(MIN_REPORTED_SLIP, count_m)
     slipping = np.flatnonzero((fit.variance_factors[:, 0] > SLIP_VARIANCE)
                               | (np.abs(slip_path) > max(4 * np.sqrt(fit.levels['along']), limit)))
     if not len(slipping):
@@ -158,8 +156,8 @@ def fix_distance_text(problem: Problem, fit: Fit) -> str:
     """Return the ratio of distances between fixes to those of the track as text, '' if 1."""
     leg, used = problem.leg, problem.used_fixes
     track, fixes = (x - x.mean(axis=0) for x in (
-        np.stack([np.interp(leg.t_fix[used], fit.state.t, p) for p in fit.state.p_n[:, :2].T], -1),
-        leg.fixes_n[used, :2]))
+        interpolated(leg.t_fix[used], fit.state.t, fit.state.p_n[:, :2]), leg.fixes_n[used, :2]))
+    # least squares: fixes = ratio times track
     size = max(float((track**2).sum()), 1e-9)
     ratio = float((track * fixes).sum()) / size
     explained = (ratio - 1)**2 * size / max(float(((fixes - track)**2).sum()), 1e-9)
@@ -186,27 +184,27 @@ class UnexplainedTravel(NamedTuple):
         """Return TRAVEL_MISSING or TRAVEL_EXCESS."""
         code, relation = (Code.TRAVEL_MISSING, 'less') if self.metres > 0 else (
             Code.TRAVEL_EXCESS, 'more')
-        where = 'at constant speed' if self.is_steady else 'while accelerating or braking'
-        remedy = ('a counter that loses pulses, or a limited speed value, at some speeds'
-                  if self.metres > 0 else 'slip, or pulses that are counted twice')
+        condition = 'at constant speed' if self.is_steady else 'while accelerating or braking'
+        cause = ('a counter that loses pulses, or a limited speed value, at some speeds'
+                 if self.metres > 0 else 'slip, or pulses that are counted twice')
         return Reason(code, (
             f'the odometer counts {abs(self.metres):.1f} m ({100 * self.share:.2g} % of the path) '
-            f'{relation} than the vehicle moves, mostly {where}: {abs(self.sigmas):.1f} sigma of '
-            f'its noise (limit {REMARK_SIGMAS:g}). The scale is that of the other seconds'),
-            f'Likely cause: {remedy}. Compare the odometer with the fixes at these speeds. The '
+            f'{relation} than the vehicle moves, mostly {condition}: {abs(self.sigmas):.1f} sigma '
+            f'of its noise (limit {REMARK_SIGMAS:g}). The scale is that of the other seconds'),
+            f'Likely cause: {cause}. Compare the odometer with the fixes at these speeds. The '
             'uncertainty was increased.')
 
 
 def find_unexplained_travel(fit: Fit, slip_path: Floats) -> UnexplainedTravel | None:
     """Return the unexplained travel, None without; slip_path : ``odometer_minus_ground_path``."""
     # slips are outliers, and counted as such
-    rows, usual = fit.weighted[MotionRows], fit.variance_factors[:, 0] <= SLIP_VARIANCE
-    hard, _ = accelerating_and_turning(rows.motion)
-    by_state = np.where(usual, -slip_path, 0.0)
-    metres, sigma = float(by_state.sum()), float(np.linalg.norm(rows.along_sigma()[usual]))
+    rows, has_no_slip = fit.weighted[MotionRows], fit.variance_factors[:, 0] <= SLIP_VARIANCE
+    accelerating, _ = accelerating_and_turning(rows.motion)
+    travel = np.where(has_no_slip, -slip_path, 0.0)
+    metres, sigma = float(travel.sum()), float(np.linalg.norm(rows.along_sigma()[has_no_slip]))
     if abs(metres) <= REMARK_SIGMAS * sigma:    # at rest, or if all slip, both are 0
         return None
-    steady = abs(by_state[~hard].sum()) > abs(by_state[hard].sum())
+    steady = abs(travel[~accelerating].sum()) > abs(travel[accelerating].sum())
     return UnexplainedTravel(metres, metres / sigma, abs(metres) / path_length(fit), bool(steady))
 
 
@@ -216,27 +214,27 @@ def describe_slip_level(fit: Fit, marginals: JointMarginals, count_m: float) -> 
     # the noise of the difference of two readings, over a phase of 10 s
     rounding = count_m * np.sqrt(2 / 12) / np.sqrt(10.0)
     # a level without information keeps its initial value
-    known = {name for name, (_, rows) in fit.weighted[MotionRows].components(marginals).items()
-             if rows > LEVEL_ROWS}
-    # m/sqrt(s), times that at constant speed: without slip it is smaller
-    if 'along_hard' not in known or level['along_hard'] <= max(
+    observed = {name for name, (_, redundancy) in fit.weighted[MotionRows].components(
+        marginals).items() if redundancy > LEVEL_ROWS}
+    # m/sqrt(s), and factor on the level at constant speed: without slip it is smaller
+    if 'along_hard' not in observed or level['along_hard'] <= max(
             0.006, 3 * level['along'], rounding):
         return ''
-    constant_speed = (f', {1e3 * level["along"]:.1f} mm/√s at constant '
-              'speed') if 'along' in known else ''
+    constant_speed = f', {1e3 * level["along"]:.1f} mm/√s at constant speed' * (
+        'along' in observed)
     return ('slip while accelerating or braking is about '
             f'{1e3 * level["along_hard"]:.0f} mm/√s{constant_speed}')
 
 
 def slip_reasons(slips: tuple[Slip, ...], level: str) -> list[Reason]:
     """Return WHEEL_SLIP with times and sizes; level : of ``describe_slip_level``."""
-    texts, listed = [], 3
+    texts, max_listed = [], 3
     if slips:
-        singles = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s for {s.duration:.0f} s'
-                   for s in slips[:listed]]
-        more = f' and {len(slips) - listed} more' if len(slips) > listed else ''
+        sizes = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s for {s.duration:.0f} s'
+                 for s in slips[:max_listed]]
+        more = f' and {len(slips) - max_listed} more' * (len(slips) > max_listed)
         texts.append('wheel slip, travel of the wheel minus travel of the vehicle: '
-                     + ', '.join(singles) + more)
+                     + ', '.join(sizes) + more)
     if level:
         texts.append(level)
     return [Reason(Code.WHEEL_SLIP, '; '.join(texts))] if texts else []

@@ -3,7 +3,7 @@
 
 """Estimates of single wheels of one or several legs: scale factors, track width, reasons."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -42,21 +42,19 @@ def wheel_details(wheels: Mapping[str, Wheel]) -> dict[str, Any]:
     return {'wheels': entries} if wheels else {}
 
 
-def unknown_wheels(names: Iterable[str], scale_unit: str) -> dict[str, Estimate]:
+def unknown_wheels(names: Sequence[str], scale_unit: str) -> dict[str, Estimate]:
     """Return the estimates of wheels without values, {} for one counter."""
-    names = list(names)
     return {FACTOR + name: Estimate(None, None, scale_unit) for name in names} | {
         width: Estimate(None, None, 'm') for width in _widths(names)}
 
 
-def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Estimate,
+def wheel_estimates(names: Sequence[str], wheels: Mapping[str, Wheel], scale: Estimate,
                     config: Config) -> tuple[dict[str, Estimate], list[Reason]]:
     """
     Return the estimates of several wheels and the reasons, docs/method.md (W4), (W8).
 
     names : of the wheels.   wheels : by name, empty if unknown.   scale : of their mean.
     """
-    names = list(names)
     estimates = unknown_wheels(names, scale.unit)
     if scale.value is None or scale.sigma is None:
         return estimates, []
@@ -64,10 +62,10 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
     # errors of left and right are opposite: that of right over left is twice that of either
     sigma = 2 * max((wheel.ratio_sigma for wheel in wheels.values()), default=np.inf)
     if sigma > limit:
-        known = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
+        accuracy = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
         pair = 'right to left wheel' if tuple(names) == SIDES else 'the wheels'
         return estimates, [Reason(
-            Code.WHEELS_NOT_SEPARABLE, f'the ratio of {pair} {known}; the limit is '
+            Code.WHEELS_NOT_SEPARABLE, f'the ratio of {pair} {accuracy}; the limit is '
             f'{100 * limit:.2g} %. The factors of the wheels are not stated')]
     for name, wheel in wheels.items():
         value = scale.value * wheel.ratio
@@ -101,21 +99,21 @@ def _different_wheel_reasons(wheels: Mapping[str, Wheel]) -> list[Reason]:
     """Return the reason for a single wheel whose factor differs from all others."""
     if len(wheels) < MIN_COMPARED_WHEELS:
         return []
-    differing = {}
+    reasons = []
     for name, wheel in wheels.items():
         others = float(np.median([w.ratio for other, w in wheels.items() if other != name]))
+        difference = wheel.ratio / others - 1
         limit = max(MAX_WHEEL_DIFFERENCE, levels.FAULT_SIGMAS * wheel.ratio_sigma)
-        if abs(wheel.ratio / others - 1) > limit:
-            differing[name] = wheel.ratio / others - 1, limit
-    return [Reason(Code.WHEEL_DEPARTS, f'the factor of wheel {name} is {100 * abs(x):.2f} % '
-                   f'{"larger" if x > 0 else "smaller"} than that of the others (limit '
-                   f'{100 * limit:.2g} %). Likely cause: tyre pressure, another tyre, or '
-                   'continuous slip') for name, (x, limit) in differing.items()
-            ] if len(differing) == 1 else []
+        if abs(difference) > limit:
+            reasons.append(Reason(
+                Code.WHEEL_DEPARTS, f'the factor of wheel {name} is {100 * abs(difference):.2f} % '
+                f'{"larger" if difference > 0 else "smaller"} than that of the others (limit '
+                f'{100 * limit:.2g} %). Likely cause: tyre pressure, another tyre, or '
+                'continuous slip'))
+    return reasons if len(reasons) == 1 else []     # of several, it is unknown which one differs
 
 
-def _track_width(left: Wheel, right: Wheel,
-                 configured: float) -> tuple[Estimate, list[Reason]]:
+def _track_width(left: Wheel, right: Wheel, configured: float) -> tuple[Estimate, list[Reason]]:
     """Return the track width and its reasons, (W8); configured : m, 0: unknown."""
     width, sigma = left.y - right.y, left.y_sigma + right.y_sigma
     unknown = Estimate(None, None, 'm')
@@ -159,6 +157,6 @@ def _mean(wheels: Sequence[Mapping[str, Any]]) -> Wheel:
         x, sigma = (np.array([w[key] for w in wheels]) for key in (name, f'{name}_sigma'))
         weight = 1 / sigma**2
         mean[name] = float(x @ weight / weight.sum())
-        chi2 = float(((x - mean[name])**2 @ weight) / max(len(x) - 1, 1))
-        mean[f'{name}_sigma'] = float(np.sqrt(max(chi2, 1.0) / weight.sum()))
+        variance_factor = float(((x - mean[name])**2 @ weight) / max(len(x) - 1, 1))
+        mean[f'{name}_sigma'] = float(np.sqrt(max(variance_factor, 1.0) / weight.sum()))
     return Wheel(**mean, walk=tuple(wheels[-1]['walk']))

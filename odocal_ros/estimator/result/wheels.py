@@ -65,16 +65,14 @@ def fit_wheels(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     t = stamp_of(state.t, state.constants)
     inside = np.flatnonzero((t >= max(w.t[0] for w in wheels))
                             & (t <= min(w.t[-1] for w in wheels)))
-    if len(inside) < MIN_WHEEL_INCREMENTS:
-        return {}
     s = np.stack([as_rolled(w, state.constants)(state.t[inside]) for w in wheels]) * state.scale
     nodes = _nodes(s, state.scale * max(w.quantum for w in wheels))
     if len(nodes) < MIN_WHEEL_INCREMENTS:
         return {}
     signals = _Signals(problem, fit, inside[nodes], s[:, nodes])
-    clock = np.array([layout.ODO_DELAY, layout.ODO_CLOCK])
-    row = np.array([1.0, state.t.mean()])
-    delay = float(np.sqrt(row @ covariance[np.ix_(clock, clock)] @ row))
+    # sigma of the delay of the odometer, in the middle of the leg
+    clock, gradient = [layout.ODO_DELAY, layout.ODO_CLOCK], np.array([1.0, state.t.mean()])
+    delay = float(np.sqrt(gradient @ covariance[np.ix_(clock, clock)] @ gradient))
     used = [layout.LN_K, *range(layout.GYRO.start, layout.GYRO.stop)]
     regressions = [signals.regression(i, delay, drift, width) for i in range(len(wheels))]
     return {wheel.name: _wheel(fitted, signals.by_constants(i, fitted),
@@ -103,7 +101,7 @@ def _unusable_times(leg: SmootherLeg) -> Iterator[tuple[float, float]]:
 
 
 class _Signals:
-    """The columns of all regressions; nodes : (k,) keyframes.   s : (w, k) m, readings there."""
+    """The signals of the regressions; nodes : (k,) keyframes.   s : (w, k) m, readings there."""
 
     def __init__(self, problem: Problem, fit: Fit, nodes: Ints, s: Floats) -> None:
         state, motion = fit.state, fit.weighted[MotionRows].motion
@@ -121,26 +119,28 @@ class _Signals:
         rate = (problem.rate_b - state.gyro_bias) @ up
         speed = np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
         self.speed_change, self.rate_change = np.diff(speed[nodes]), np.diff(rate[nodes])
-        hard, turns = accelerating_and_turning(motion)
-        kind = np.where(turns, 2, np.where(hard, 1, 0))
+        accelerating, turning = accelerating_and_turning(motion)
+        kind = np.where(turning, 2, np.where(accelerating, 1, 0))
         self.kind = kind[np.clip(nodes[1:] - 1, 0, len(kind) - 1)]
         self.T, self.t = np.diff(state.t[nodes]), state.t[nodes]
-        # s of driving, less below 1 m/s
+        # s, duration of driving: below 1 m/s in proportion to the path
         path = np.abs(np.diff(s)).max(axis=0)
         self.walk_time = np.clip(path, 0.02 * np.minimum(self.T, 1.0), self.T)
         stamp = stamp_of(self.t, state.constants)
         for begin, end in _unusable_times(problem.leg):
             self.walk_time[(stamp[1:] > begin) & (stamp[:-1] < end)] = UNUSABLE_WALK_TIME
         self.scale = state.scale
-        self.steer = {i: self._steering(state, up, i) for i, fixed in enumerate(self.fixed)
-                      if not fixed}
+        self.steering_paths = {i: self._steering_path(state, up, i)
+                               for i, fixed in enumerate(self.fixed) if not fixed}
 
     def _prior_y(self, i: int, width: float) -> float:
         """Return the prior y of a wheel, m: left, right of each axle, 0 of an odd last one."""
-        alone = i == len(self.leg.wheels) - 1 and i % 2 == 0
-        return 0.0 if alone else (width or TRACK_WIDTH.of_a_car) / 2 * (1 if i % 2 == 0 else -1)
+        is_left = i % 2 == 0
+        if is_left and i == len(self.leg.wheels) - 1:
+            return 0.0
+        return (width or TRACK_WIDTH.of_a_car) / 2 * (1 if is_left else -1)
 
-    def _steering(self, state: layout.State, up: Floats, i: int) -> Floats:
+    def _steering_path(self, state: layout.State, up: Floats, i: int) -> Floats:
         """Return the increments of q of a steered wheel, (W9): (k - 1,) 1/m."""
         leg, scale = self.leg, state.scale
         t = np.arange(self.t[0], self.t[-1], STEER_GRID)
@@ -161,8 +161,8 @@ class _Signals:
         prior = np.array([1.0, width_sigma or TRACK_WIDTH.any_sigma, WHEEL_DELAY_SIGMA,
                           max(delay, 1e-4), max(drift, 1e-9)])
         mean = np.array([0.0, y0 if width_sigma else 0.0, 0.0, 0.0, 0.0])
-        if i in self.steer:
-            X = np.column_stack([X, self.steer[i]])
+        if i in self.steering_paths:
+            X = np.column_stack([X, self.steering_paths[i]])
             prior, mean = np.append(prior, WHEELBASE**2), np.append(mean, 0.0)
         weight = np.where(self.fixed, -1 / self.fixed.sum(), 0.0)
         weight[i] += 1.0
@@ -176,7 +176,7 @@ class _Signals:
         """Return the derivatives of a - 1, a y and a x^2 by ln K and GYRO, J of (W4)."""
         x, gain = fitted.x, np.delete(fitted.gain, NUISANCE, axis=0)
         by_scale, by_gyro = [0.0, x[1]], -gain @ self.turn_errors * x[1]
-        if i in self.steer:     # q is proportional to the square of the turn over the path
+        if i in self.steering_paths:     # q is proportional to the squared turn over the path
             by_scale.append(2 * x[-1])
             curvature = self.turn / np.where(self.path, self.path, np.inf)
             by_gyro += gain @ (curvature[:, None] * self.turn_errors) * x[-1]
