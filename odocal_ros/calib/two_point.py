@@ -57,7 +57,7 @@ class TwoPointInput:
     @property
     def M(self) -> Floats:
         """Return M of docs/method.md (T3): attitude summed over travel, (3, 3) scale units."""
-        return self.track.at(self.end.t) - self.track.at(self.start.t)
+        return self.track.P_at(self.end.t) - self.track.P_at(self.start.t)
 
 
 def solve(inputs: TwoPointInput, up_scale: float = 1.0) -> tuple[Floats, Reason | None]:

@@ -184,7 +184,7 @@ def _expected_mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
     """Return the expected reference position at a mark, surveyed or from the fixes at it."""
     span = standing_at(t, spans)
     forward = np.array([1.0, 0.0, 0.0])
-    position_n = (track.at(np.array(t)) - track.at(np.array(0.0))) @ forward
+    position_n = (track.P_at(np.array(t)) - track.P_at(np.array(0.0))) @ forward
     if surveyed:
         return MarkFix(t, position_n, np.eye(3) * surveyed[3]**2, span is not None, 0,
                        surveyed=True)

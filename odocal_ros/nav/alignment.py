@@ -31,12 +31,12 @@ REST_EDGE = 0.3
 class Alignment:
     """Attitude and gyro bias at one epoch; frames n and b as in the package, 1 sigma."""
 
-    t: float                  # s since the start mark, start of the strapdown
+    t: float                  # s since the start mark, the epoch: start of the strapdown
     C_nb: Floats              # (3, 3) b to n
     gyro_bias: Floats         # (3,) rad/s, in b
     level_sigma: float        # rad, each of east and north
     heading_sigma: float      # rad
-    gyro_bias_sigma: Floats   # (3,) rad/s
+    gyro_bias_sigma: Floats   # (3,) rad/s, in b
     gyro_noise: float         # rad/s/sqrt(Hz)
     gyro_bias_walk: float     # rad/s/sqrt(s)
     # setting alignment.source; a heading by ``course`` includes the yaw mounting angle
@@ -104,13 +104,12 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
     if not inside.any():        # rows only at its ends
         inside = (t >= span[0]) & (t <= span[1])
     length = max(span[1] - span[0] - 2 * edge, 1e-3)
-    up_b = f_b[inside].mean(axis=0)
-    g = np.linalg.norm(up_b)
-    sigma = np.hypot(grade.level_bias, grade.accel_noise / np.sqrt(length)) / g
-    end = t[inside][-1]
+    force = f_b[inside].mean(axis=0)
+    sigma = np.hypot(grade.level_bias, grade.accel_noise / np.sqrt(length)) / np.linalg.norm(force)
     rate_sigma = np.hypot(gyro_noise / np.sqrt(length), grade.gyro_bias_walk * np.sqrt(length / 3))
-    return LevelAttitude(float(end), level_frame(up_b), float(sigma), w_b[inside].mean(axis=0),
-                         float(rate_sigma), (float(span[0]), float(span[1])))
+    return LevelAttitude(float(t[inside][-1]), level_frame(force), float(sigma),
+                         w_b[inside].mean(axis=0), float(rate_sigma),
+                         (float(span[0]), float(span[1])))
 
 
 def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitude: float,
@@ -134,9 +133,9 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     g = gravity(latitude, 0.0)
     max_speed = np.abs(speed).max()
     # rotation of the level until half of the interval, and Coriolis acceleration 2 Omega v
-    earth = OMEGA * (T / 2 + 2 * max_speed / g)
-    mounting = 0.05 * max_speed / (g * T)
-    errors = (grade.level_bias / g, grade.gyro_bias * T / 2, earth, mounting)
+    by_earth = OMEGA * (T / 2 + 2 * max_speed / g)
+    by_mounting = 0.05 * max_speed / (g * T)
+    errors = (grade.level_bias / g, grade.gyro_bias * T / 2, by_earth, by_mounting)
     return LevelAttitude(float(t[0]), level_frame(up_0), float(np.linalg.norm(errors)),
                          np.zeros(3), 0.0, None)
 
@@ -201,8 +200,7 @@ def _gyro_bias_n(level: LevelAttitude, C_nb: Floats, yaw_sigma: float, origin: O
     unknown = np.array(origin.local_earth_rate.sigma_n) if origin.local_earth_rate else 0.0
     sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2 + unknown**2)
     measured = C_nb @ level.mean_rate_b - origin.earth_rate_n
-    # sigmas of noise and turn-on bias: with a larger rate the grade is wrong
-    ruled_out_sigmas = 10.0
-    known = (sigma < grade.gyro_bias) | (
-        np.abs(measured) > ruled_out_sigmas * np.hypot(sigma, grade.gyro_bias))
-    return np.where(known, measured, 0.0), np.where(known, sigma, grade.gyro_bias)
+    max_sigmas = 10.0       # of noise and turn-on bias: with a larger rate the grade is wrong
+    is_used = (sigma < grade.gyro_bias) | (
+        np.abs(measured) > max_sigmas * np.hypot(sigma, grade.gyro_bias))
+    return np.where(is_used, measured, 0.0), np.where(is_used, sigma, grade.gyro_bias)

@@ -10,11 +10,12 @@ accurate: when the value changes by one step, the speed passes the edge between 
 it changes by more, each value only determines its interval. Zero is an exception: it includes all
 speeds that the sender treats as rest.
 
-Other speeds are held, repeated until they have changed by a step, as on many buses. The value
+Other speeds are held: repeated until they have changed by a step, as on many buses. The value
 after a change is correct. Until the next change the speed is within one step of it, in the
 direction of the change: half a step is added, and the error is uniform over the step, not noise.
-Zeros are used unchanged: at standstill the vehicle does not move. ``find_coarse_speed`` and
-``find_held_speed`` detect both.
+Zeros are used unchanged: at standstill the vehicle does not move.
+
+``find_coarse_speed`` and ``find_held_speed`` return the two kinds, from the rows of a speed.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.nav.time_series import MISSING_INTERVALS
 
 MIN_EDGE_SIGMA = 0.02      # judgement: in steps, minimum sigma of a speed at an edge
-MIN_SPAN_STEPS = 3.0          # judgement: steps that the values must span
+MIN_SPAN_STEPS = 3.0       # judgement: least range of the values, in steps
 MIN_COHERENCE = 0.9     # judgement: coherence of distinct values at 1 / step; 1: all are multiples
 # judgement: bins of the values' span; FFT size with zero padding; FFT size of the quick test
 VALUE_BINS, FFT_SIZE, QUICK_FFT_SIZE = 2**17, 2**20, 2**18
@@ -55,12 +56,12 @@ class SpeedInstants:
 
 @dataclass(frozen=True, eq=False)
 class CoarseSpeed:
-    """A speed in multiples of a step: rows with information, (n,)."""
+    """A speed in multiples of a step: its n rows that are not interpolated."""
 
     step: float      # scale units per s
-    t: Floats        # s
-    value: Floats    # scale units per s
-    interpolated: bool = False    # the sender also publishes interpolated rows between these
+    t: Floats        # (n,) s
+    value: Floats    # (n,) scale units per s
+    interpolated: bool = False    # True: the sender publishes interpolated rows between these
 
     @property
     def truncation(self) -> float:
@@ -90,7 +91,7 @@ class CoarseSpeed:
         A run of equal values has one error, uniform in its interval, that does not average out. It
         is replaced by white noise with the same variance over the run.
         """
-        first = np.flatnonzero(np.diff(self.value, prepend=np.nan))
+        first = np.flatnonzero(np.diff(self.value, prepend=np.nan))      # rows of runs
         begin = self.t[first]
         duration = np.diff(begin, append=self.t[-1])
         power = self.step**2 / 12 * duration * (self.value[first] != 0)
@@ -128,15 +129,15 @@ class CoarseSpeed:
             is_edge &= dt <= MISSING_INTERVALS * usual_dt
         is_run = (steps[:-1] > 1) & (steps[1:] > 1) & (sizes[0][1:] >= min_multiple)
         first, length = after[:-1][is_run], np.diff(before)[is_run]
-        # one row of each run, at varying places: the middle one of a run at an extremum of the
+        # one row of each run, at varying places: the middle row of a run at an extremum of the
         # speed would be the fastest. Multiples of the golden ratio are evenly distributed
         golden = 0.618034
         row = first + (length * (np.arange(len(first)) * golden % 1.0)).astype(int)
-        instant, value = np.r_[t_middle[is_edge], t[row]], np.r_[edge[is_edge], v[row]]
+        t_out, value = np.r_[t_middle[is_edge], t[row]], np.r_[edge[is_edge], v[row]]
         width = np.r_[speed_change[is_edge], np.full(len(row), step)]
         sigma = np.hypot(width / np.sqrt(12), MIN_EDGE_SIGMA * step)
-        order = np.argsort(instant, kind='stable')
-        return SpeedInstants(instant[order], value[order], np.sign(value[order]), sigma[order])
+        order = np.argsort(t_out, kind='stable')
+        return SpeedInstants(t_out[order], value[order], np.sign(value[order]), sigma[order])
 
 
 def _rate_limits(t: Floats, edge: Floats, step: float) -> Floats:
@@ -180,19 +181,17 @@ class HeldSpeed(CoarseSpeed):
 
 def find_coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
     """Return a quantised speed from its rows, (n,) s, scale units per s; None if it is not one."""
-    step = find_step(value)
-    top = np.abs(value).max(initial=0.0)
-    knots = np.ones(len(value), bool)       # rows that are not on the line between adjacent ones
-    if len(value) > 2:
-        zero_of_top = 1e-6    # of the top speed: limit of a second difference of zero
-        knots[1:-1] = np.abs(np.diff(value, n=2)) > zero_of_top * top
+    step, is_knot = find_step(value), np.ones(len(value), bool)
+    if len(value) > 2:      # rows that are not on the line between adjacent ones
+        rounding = 1e-6    # of the top speed
+        is_knot[1:-1] = np.abs(np.diff(value, n=2)) > rounding * np.abs(value).max()
     changes = np.diff(value, prepend=value[:1]) != 0
     knot_share = 0.5    # of the rows that change: an interpolation has fewer knots
-    if (knots & changes).sum() < knot_share * changes.sum():
-        knot_step = find_step(value[knots])
+    if (is_knot & changes).sum() < knot_share * changes.sum():
+        knot_step = find_step(value[is_knot])
         min_ratio = 1.5    # of the step of the knots to that of all rows
-        if knot_step and knot_step > min_ratio * (step or 0.0):
-            return CoarseSpeed(knot_step, t[knots], value[knots], interpolated=True)
+        if knot_step and (step is None or knot_step > min_ratio * step):
+            return CoarseSpeed(knot_step, t[is_knot], value[is_knot], interpolated=True)
     return CoarseSpeed(step, t, value) if step else None
 
 
@@ -220,11 +219,12 @@ def find_step(value: Floats) -> float | None:
     high = np.flatnonzero((coherence > MIN_COHERENCE) & (frequency > MIN_SPAN_STEPS / span))
     if not len(high):
         return None
-    last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
+    # the first peak: the first run of adjacent frequencies with a high coherence, and its maximum
+    last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))
     peak = high[0] + int(np.argmax(coherence[high[0]:last + 1]))
     step = _refine_step(value, 1 / float(frequency[peak]))
-    min_multiples = 6
     # values accumulate at the start of a cruise: two or three such speeds always have some step
+    min_multiples = 6
     return step if len(np.unique(np.rint(value / step))) >= min_multiples else None
 
 
@@ -249,8 +249,8 @@ def _may_have_step(bins: Ints) -> bool:
 
 def _step_of_few_values(value: Floats, distinct: Floats, count: Ints) -> float | None:
     """Return the step of few distinct values, each of them repeated; count : their rows."""
-    few_values, often_sent = 4, 5    # least number of distinct values, and of repetitions
-    if len(distinct) < few_values or np.median(count) < often_sent:
+    min_values, min_repetitions = 4, 5
+    if len(distinct) < min_values or np.median(count) < min_repetitions:
         return None
     step = _refine_step(value, float(np.diff(distinct).min()))
     deviation = distinct / step - np.rint(distinct / step)
@@ -277,6 +277,7 @@ def find_held_speed(t: Floats, value: Floats) -> HeldSpeed | None:
     step = float(changes.min())
     if step < MIN_SMALLEST_CHANGE * np.percentile(changes, 10):
         return None
+    # of each row: the last row with a change, and the direction of this change
     changed_rows = np.where(change != 0, np.arange(1, len(value)), 0)
     last_change = np.maximum.accumulate(changed_rows)
     direction = np.append(0.0, np.sign(change)[np.maximum(last_change - 1, 0)])

@@ -74,17 +74,17 @@ class Track:
     s: Floats       # (m,) travel, scale units
     P: Floats       # (m, 3, 3) scale units, sum of C_nb over travel from the first epoch
 
-    def at(self, t: float | Floats) -> Floats:
+    def P_at(self, t: float | Floats) -> Floats:
         """Return P at times t, linear between epochs, constant outside: (...) to (..., 3, 3)."""
         last = len(self.t) - 1
         k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, max(last - 1, 0))
         after = np.minimum(k + 1, last)         # a track may have a single epoch
-        min_epoch_step = 1e-9    # s, shorter than any step
-        step = np.maximum(self.t[after] - self.t[k], min_epoch_step)
-        x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
+        min_interval = 1e-9    # s, shorter than any interval of epochs
+        interval = np.maximum(self.t[after] - self.t[k], min_interval)
+        share = np.clip((t - self.t[k]) / interval, 0.0, 1.0)[..., None, None]
         P, P_after = self.P.take(k, axis=0), self.P.take(after, axis=0)
-        P *= 1 - x
-        P_after *= x
+        P *= 1 - share
+        P_after *= share
         P += P_after
         return P
 
@@ -104,12 +104,12 @@ class Track:
 
         f : (3,) m per unit of travel, in b.
         """
-        start = self.at(t_start)
+        start = self.P_at(t_start)
         return map_rows(lambda P: (P - start) @ f, self.P[rows])
 
 
 def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
-    """Return the track, attitude over travel by the trapezoid rule: docs/method.md (T1)."""
+    """Return the track: sums of attitude times travel, trapezoid rule, docs/method.md (T1)."""
     s = travel.at(t)
     half, P = (np.diff(s) / 2)[:, None, None], work_array(len(t), 3, 3)
     for rows in chunks(len(t) - 1):
@@ -168,21 +168,21 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
 
 def section_ratio(s: Floats, path: Floats, p: Floats, min_chord: float) -> float | None:
     """
-    Return the median ratio of distance between fixes to distance on a path, None without sections.
+    Return the median ratio of distances between fixes to those on a path, None without sections.
 
-    s, path, p : (n,) travel, (n, k) path in its units, (n, 2) fixes, m, all at their times. The
-    sections are equal in travel, as short as possible with a median distance of ``min_chord``, m.
+    s, path, p : (n,) travel, (n, k) path in units of travel, (n, 2) fixes, m, at the same times.
+    Sections of equal travel, as short as possible with a median distance of ``min_chord``, m.
     """
     path_length = running_sum(np.abs(np.diff(s)))
-    pieces = len(s) // 2
-    while pieces and path_length[-1] > 0:
-        k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
+    count = len(s) // 2      # of sections
+    while count and path_length[-1] > 0:
+        k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], count + 1)))
         chord = np.hypot(*np.diff(p[k], axis=0).T)
         path_chord = np.sqrt((np.diff(path[k], axis=0)**2).sum(axis=1))
         moves = path_chord > 0
         if moves.any() and np.median(chord[moves]) >= min_chord:
             return float(np.median(chord[moves] / path_chord[moves]))
-        pieces //= 2
+        count //= 2
     return None
 
 

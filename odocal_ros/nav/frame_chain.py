@@ -21,7 +21,7 @@ MAX_INTERPOLATION_NS = 500_000_000
 RESTART_NS = 10**9        # judgement: a larger backward step of the stamps is a restart
 MAX_WAITING = 10_000     # judgement: transforms of a frame kept while another one is missing
 StampedPositions = tuple[Ints, Ints, Floats]      # stamps, arrivals, positions
-Values = Sequence[float]      # of a child in its parent: x y z, m, and quaternion x y z w
+Transform = Sequence[float]      # of a child in its parent: x y z, m, and quaternion x y z w
 
 
 @dataclass(eq=False)
@@ -30,11 +30,11 @@ class _MovingFrame:
 
     parent: str
     newest_ns: int = -1
-    stamps: list[int] = field(default_factory=list)
-    received: list[int] = field(default_factory=list)
-    values: list[Values] = field(default_factory=list)
+    stamps: list[int] = field(default_factory=list)      # ns, as the next one
+    received: list[int] = field(default_factory=list)    # arrivals
+    values: list[Transform] = field(default_factory=list)
 
-    def add(self, stamp_ns: int, received_ns: int, values: Values) -> None:
+    def add(self, stamp_ns: int, received_ns: int, values: Transform) -> None:
         if stamp_ns <= self.newest_ns:
             return      # repeated or late
         self.newest_ns = stamp_ns
@@ -61,12 +61,12 @@ class FrameChain:
     def __init__(self, parent: str, child: str) -> None:
         self.parent, self.child = parent, child
         self._moving: dict[str, _MovingFrame] = {}
-        self._static: dict[str, tuple[str, Values]] = {}
+        self._static: dict[str, tuple[str, Transform]] = {}      # parent and transform, by child
         self._path: list[str] | None = None      # children, from the parent downwards
-        self._last_correction: Values | None = None    # of the moving frame next to the parent
+        self._last_correction: Transform | None = None    # of the moving frame next to the parent
         self._computed: list[StampedPositions] = []    # not yet popped
 
-    def add(self, child: str, parent: str, stamp_ns: int, received_ns: int, values: Values
+    def add(self, child: str, parent: str, stamp_ns: int, received_ns: int, values: Transform
             ) -> None:
         """Add a transform with a stamp; the first parent of a child applies."""
         if self._path is None or child in self._path:
@@ -83,26 +83,27 @@ class FrameChain:
                 frame.drop_oldest(len(frame.stamps) - MAX_WAITING + 1)
             frame.add(stamp_ns, received_ns, values)
 
-    def add_static(self, child: str, parent: str, values: Values) -> None:
+    def add_static(self, child: str, parent: str, values: Transform) -> None:
         """Add a static transform; the first one of a child applies."""
         self._static.setdefault(child, (parent, values))
 
     @property
     def frames(self) -> list[str]:
         """Return the names of all known frames, sorted."""
-        parents = {x.parent for x in self._moving.values()} | {p for p, _ in self._static.values()}
+        parents = {frame.parent for frame in self._moving.values()} | {
+            parent for parent, _ in self._static.values()}
         return sorted(parents | set(self._moving) | set(self._static))
 
     def top(self) -> str:
-        """Return the topmost known frame, reached from the child upwards."""
-        return self._walk()[0]
+        """Return the topmost known frame above the child."""
+        return self._find_path()[0]
 
     def is_moving(self) -> bool:
         """Return True if one of the transforms has stamps."""
-        return any(name in self._moving for name in self._walk()[1])
+        return any(name in self._moving for name in self._find_path()[1])
 
-    def _walk(self) -> tuple[str, list[str]]:
-        """Return the last known frame from the child upwards, and the children below it."""
+    def _find_path(self) -> tuple[str, list[str]]:
+        """Return the topmost known frame above the child, and the children from it downwards."""
         frame, path = self.child, list[str]()
         while frame != self.parent and frame not in path:
             if frame not in self._moving and frame not in self._static:
@@ -112,7 +113,7 @@ class FrameChain:
         return frame, path
 
     def pop_positions(self) -> StampedPositions:
-        """Return stamps and arrivals, ns, and positions (n, 3), m, that are new since the last."""
+        """Return stamps and arrivals, ns, and positions (n, 3), m, new since the last call."""
         parts, self._computed = [*self._computed, self._compute_positions()], []
         stamps, received, position = (np.concatenate(x) for x in zip(*parts, strict=True))
         return stamps, received, position
@@ -121,34 +122,35 @@ class FrameChain:
         """Return the new positions since the last restart of the stamps."""
         empty = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))
         if self._path is None:
-            top, path = self._walk()
+            top, path = self._find_path()
             if top != self.parent or not self.is_moving():
                 return empty
             self._path = path
             self._moving = {name: x for name, x in self._moving.items() if name in path}
-        first, *others = (self._moving[name] for name in self._path if name in self._moving)
-        # first: the moving frame next to the parent; its rows up to the newest stamp of all others
-        known_ns = min((frame.newest_ns for frame in others), default=first.newest_ns)
-        n = int(np.searchsorted(first.stamps, known_ns, side='right'))
+        # the moving frame next to the parent; its rows up to the newest stamp of all others
+        corrected, *others = (self._moving[name] for name in self._path if name in self._moving)
+        end_ns = min((frame.newest_ns for frame in others), default=corrected.newest_ns)
+        n = int(np.searchsorted(corrected.stamps, end_ns, side='right'))
         if not n:
             return empty
-        stamps, received = np.array(first.stamps[:n]), np.array(first.received[:n])
+        stamps, received = np.array(corrected.stamps[:n]), np.array(corrected.received[:n])
         position, is_usable = np.zeros((n, 3)), np.ones(n, bool)
         if others:      # a repeated correction gives no position
-            before = [self._last_correction or first.values[0], *first.values]
-            is_usable = np.array([a != b for a, b in zip(before, first.values[:n], strict=False)])
-            self._last_correction = first.values[n - 1]
+            before = [self._last_correction or corrected.values[0], *corrected.values]
+            is_usable = np.array([a != b for a, b in zip(
+                before, corrected.values[:n], strict=False)])
+            self._last_correction = corrected.values[n - 1]
         for name in reversed(self._path):
             if name not in self._moving:
                 values = np.array([self._static[name][1]])
-            elif self._moving[name] is first:
-                values = np.array(first.values[:n])
+            elif self._moving[name] is corrected:
+                values = np.array(corrected.values[:n])
             else:
                 values, is_near = _interpolate(self._moving[name], stamps)
                 is_usable &= is_near
             position = _to_parent_frame(values, position)
-        first.drop_oldest(n)
-        for frame in others:     # the previous one is needed for later positions
+        corrected.drop_oldest(n)
+        for frame in others:     # the previous transform is needed for later positions
             frame.drop_oldest(int(np.searchsorted(frame.stamps, stamps[-1], side='right')) - 1)
         return stamps[is_usable], received[is_usable], position[is_usable]
 
@@ -165,8 +167,8 @@ def _interpolate(frame: _MovingFrame, stamps: Ints) -> tuple[Floats, Bools]:
     share = (elapsed / np.maximum(step, 1))[:, None]
     a, b = values[before], values[after].copy()
     # q and -q are the same rotation. Not slerp: the direction differs by less than angle^3 / 100
-    opposite = a[:, 3] * b[:, 3] + a[:, 4] * b[:, 4] + a[:, 5] * b[:, 5] + a[:, 6] * b[:, 6] < 0
-    b[opposite, 3:] = -b[opposite, 3:]
+    is_opposite = a[:, 3] * b[:, 3] + a[:, 4] * b[:, 4] + a[:, 5] * b[:, 5] + a[:, 6] * b[:, 6] < 0
+    b[is_opposite, 3:] = -b[is_opposite, 3:]
     return a + share * (b - a), is_usable
 
 

@@ -27,7 +27,7 @@ class Travel:
     t: Floats         # (n,) s since the start mark, rising
     s: Floats         # (n,) signed travel from the first row
     quantum: float    # size of one count, scale units; 0 for speeds and floats
-    coarse: coarse_speed.CoarseSpeed | None = None    # measured speeds, if in steps, of one wheel
+    coarse: coarse_speed.CoarseSpeed | None = None    # its speeds, if published in steps
     name: str = ''         # of the wheel, '' for a single one or a mean
     # scale units, of a steered wheel from the axle that does not steer; 0: it does not steer
     distance_ahead: float = 0.0
@@ -43,13 +43,13 @@ class Travel:
         The slope between rounded rows is not the speed: a fit of the delay would not converge with
         it if there are few other errors. Rows beside gaps and at the ends are not smoothed.
         """
-        step = float(np.median(np.diff(self.t))) if self.quantum and len(self.t) > 1 else np.inf
-        m = int(SMOOTHING_REACH / step)        # rows to each side
+        period = float(np.median(np.diff(self.t))) if self.quantum and len(self.t) > 1 else np.inf
+        m = int(SMOOTHING_REACH / period)        # rows to each side
         if m < 2 or len(self.t) <= 2 * m:
             return self
         # parabola by least squares at its middle (Savitzky and Golay 1964)
         weights = 3.0 * (3 * m**2 + 3 * m - 1 - 5 * np.arange(-m, m + 1)**2)
-        even = self.t[2 * m:] - self.t[:-2 * m] < 3 * m * step      # longer by half: a gap
+        even = self.t[2 * m:] - self.t[:-2 * m] < 3 * m * period      # longer by half: a gap
         t, s = (np.concatenate([x[:m], np.where(even, np.convolve(
             x, weights / weights.sum(), 'valid'), x[m:-m]), x[-m:]]) for x in (self.t, self.s))
         return replace(self, t=t, s=s) if (np.diff(t) > 0).all() else self
@@ -73,27 +73,24 @@ def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: b
     the values.   reversed_counts : positive values mean backwards.   name : of the counter in
     reasons. Rollovers are corrected, resets interpolated by the adjacent speed.
     """
-    is_integer = np.issubdtype(value.dtype, np.integer)
+    is_integer, sign = np.issubdtype(value.dtype, np.integer), -1.0 if reversed_counts else 1.0
     reasons: tuple[Reason, ...] = ()
     coarse = None
     if form.quantity == 'rate':
-        speed = value.astype(float, copy=False)
-        signed = -speed if reversed_counts else speed
-        coarse = coarse_speed.find_coarse_speed(t, signed)
-        held = coarse_speed.find_held_speed(t, signed)
+        speed = sign * value.astype(float, copy=False)
+        coarse = coarse_speed.find_coarse_speed(t, speed)
+        held = coarse_speed.find_held_speed(t, speed)
         # a held speed takes precedence over a finer step
         if held and (coarse is None or coarse.step < held.step / 2):
-            coarse = held
-        if isinstance(coarse, coarse_speed.HeldSpeed):
-            speed = -coarse.value if reversed_counts else coarse.value
+            coarse, speed = held, held.value
         step = (speed[:-1] + speed[1:]) / 2 * np.diff(t)
     elif form.quantity == 'increment':
-        step = value[1:].astype(float)
+        step = sign * value[1:].astype(float)
     else:
         step, reasons = _counter_steps(t, value, form.modulus, name)
-    s = running_sum(step) if len(value) else np.empty(0)
+        step = sign * step
     quantum = _quantum(step) if is_integer and form.quantity != 'rate' else 0.0
-    return Travel(t, -s if reversed_counts else s, quantum, coarse), reasons
+    return Travel(t, running_sum(step) if len(value) else np.empty(0), quantum, coarse), reasons
 
 
 def _quantum(step: Floats) -> float:
@@ -114,12 +111,12 @@ def mean_travel(travels: Sequence[Travel]) -> Travel:
     first, *others = travels
     if not others:
         return first
-    if not all(len(one.t) for one in others):
+    if not all(len(travel.t) for travel in others):
         return Travel(first.t[:0], first.s[:0], first.quantum)
-    common = (first.t >= max(one.t[0] for one in others)) & (
-        first.t <= min(one.t[-1] for one in others))
+    common = (first.t >= max(travel.t[0] for travel in others)) & (
+        first.t <= min(travel.t[-1] for travel in others))
     t = first.t[common]
-    s = sum((one.at(t) for one in others), first.s[common]) / len(travels)
+    s = sum((travel.at(t) for travel in others), first.s[common]) / len(travels)
     return Travel(t, s - (s[0] if len(s) else 0.0), first.quantum / np.sqrt(len(travels)))
 
 
@@ -138,21 +135,21 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
     """Return steps of a counter as floats, rollovers and resets corrected; and the reasons."""
     is_integer = np.issubdtype(value.dtype, np.integer)
     raw = np.diff(value)
-    counted = without_rollover(raw, modulus)
-    rolled, step = counted != raw, counted.astype(float)
+    unwrapped = without_rollover(raw, modulus)
+    step = unwrapped.astype(float)
     resets = _find_resets(t, step, is_integer)
+    rollovers = (unwrapped != raw) & ~resets
     reasons: tuple[Reason, ...] = ()
     if resets.any():
-        first = int(np.argmax(resets))
-        step, count = _bridge_resets(t, step, resets), int(resets.sum())
+        first, count = int(np.argmax(resets)), int(resets.sum())
+        step = _bridge_resets(t, step, resets)
         jump = value[first + 1].item() - value[first].item()
-        by = f'{jump:+}' if is_integer else f'{jump:+.6g}'
-        reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by {by} at t = '
+        reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by '
+                           f'{jump:{"+" if is_integer else "+.6g"}} at t = '
                            f'{t[first + 1]:.2f} s ({count} such step{"s" * (count > 1)}): a '
                            'reset, not motion; interpolated from the adjacent speed'),)
-    rolled &= ~resets
-    if rolled.any():
-        first, count = int(np.argmax(rolled)), int(rolled.sum())
+    if rollovers.any():
+        first, count = int(np.argmax(rollovers)), int(rollovers.sum())
         reasons += (Reason(Code.COUNTER_ROLLOVER, f'{name} rolled over {count} '
                            f'time{"s" * (count > 1)} (modulus {modulus}), first at t = '
                            f'{t[first + 1]:.2f} s; corrected'),)
@@ -164,12 +161,12 @@ def _find_resets(t: Floats, step: Floats, is_integer: bool) -> Bools:
     dt = np.diff(t)
     if len(step) < MIN_STEPS or not step.any():
         return np.zeros(len(step), bool)
-    usual = np.median(dt)
-    rate = np.abs(step) / np.maximum(dt, usual)    # for bursts of stamps
+    period = np.median(dt)
+    rate = np.abs(step) / np.maximum(dt, period)    # of bursts of stamps: not too large
     if not (rate > 0).any():       # steps so small that their rates are zero
         return np.zeros(len(step), bool)
     limit = RESET_FACTOR * np.percentile(rate[rate > 0], 95)
-    resets = rate > (max(limit, 3 / usual) if is_integer else limit)
+    resets = rate > (max(limit, 3 / period) if is_integer else limit)     # at least 3 counts
     # motion lasts for several steps; a reset is one large step, a false row is two
     for begin, end in runs(resets):
         if end - begin > 2:
@@ -180,12 +177,8 @@ def _find_resets(t: Floats, step: Floats, is_integer: bool) -> Bools:
 def _bridge_resets(t: Floats, step: Floats, resets: Bools) -> Floats:
     """Return the steps with those of resets replaced by the speed beside them: (n - 1,)."""
     dt = np.diff(t)
-    step = step.copy()
-    good = np.flatnonzero(~resets & (dt > 0))
-    if len(good):
-        bad = np.flatnonzero(resets)
-        rate = step[good] / np.maximum(dt[good], np.median(dt))    # as in _find_resets
-        step[bad] = np.interp(bad, good, rate) * dt[bad]
-    else:
-        step[resets] = 0.0
+    step, rows = step.copy(), np.flatnonzero(resets)
+    others = np.flatnonzero(~resets & (dt > 0))
+    rate = step[others] / np.maximum(dt[others], np.median(dt))    # as in _find_resets
+    step[rows] = np.interp(rows, others, rate) * dt[rows] if len(others) else 0.0
     return step

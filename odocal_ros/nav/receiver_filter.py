@@ -34,19 +34,18 @@ def filter_error(t: Floats, position: Floats, velocity: Floats, times: Floats,
     t, position, velocity : (n,) s, rising, (n, 3) m and m/s of the antenna, with cubics in
     between.   times : (k,) s, stamps minus their delay.   lag_square : s^2, as above.
     """
-    def error(lag_square: float) -> Floats:
+    def compute_error(lag_square: float) -> Floats:
         if lag_square > 0:
             track, tau = _Track(t, position, velocity), np.sqrt(lag_square)
-            return track.smoothed(times + tau, tau) - track.at(times)
+            return track.smoothed(times + tau, tau) - track.position_at(times)
         return _tracking_error(t, position, velocity, times, np.sqrt(-lag_square / 2))
 
     if abs(lag_square) <= MIN_LAG2:
-        small = -MIN_LAG2 if lag_square < 0 else MIN_LAG2
-        rate = error(small) / small
-        return rate * lag_square, rate
-    value = error(lag_square)
-    lag2_step = 1e-4    # relative step of the difference that gives a derivative
-    return value, (error(lag_square * (1 + lag2_step)) - value) / (lag_square * lag2_step)
+        smallest = -MIN_LAG2 if lag_square < 0 else MIN_LAG2
+        gradient = compute_error(smallest) / smallest
+        return gradient * lag_square, gradient
+    error, step = compute_error(lag_square), 1e-4      # relative, of a difference quotient
+    return error, (compute_error(lag_square * (1 + step)) - error) / (lag_square * step)
 
 
 def _cubic_coefficients(t: Floats, position: Floats,
@@ -71,8 +70,8 @@ def odometer_error(t: Floats, position: Floats, velocity: Floats, times: Floats,
     logarithm of the time, s.
     """
     track, time, step = _Track(t, position, velocity), np.exp(log_time), 1e-3    # of the logarithm
-    motion = track.at(times) - track.smoothed(times, time)
-    longer = track.at(times) - track.smoothed(times, time * np.exp(step))
+    motion = track.position_at(times) - track.smoothed(times, time)
+    longer = track.position_at(times) - track.smoothed(times, time * np.exp(step))
     return scale_error * motion, motion, scale_error * (longer - motion) / step
 
 
@@ -93,7 +92,7 @@ class _Track:
         return k, s, self.position[k] + s * (
             self.velocity[k] + s * (self.bend[k] + s * self.twist[k]))
 
-    def at(self, times: Floats) -> Floats:
+    def position_at(self, times: Floats) -> Floats:
         """Return the positions, (k, 3)."""
         return self._cubic(times)[2]
 
@@ -105,11 +104,12 @@ class _Track:
         """
         T, bend, twist = self.T, self.bend, self.twist
         # where two cubics meet, their responses differ by jumps of p'' and p'''
-        first = tau**2 * (2 * bend - 6 * tau * twist)
-        last = tau**2 * (2 * bend + 6 * (T - tau) * twist)
+        start = tau**2 * (2 * bend - 6 * tau * twist)
+        end = tau**2 * (2 * bend + 6 * (T - tau) * twist)
+        # transients at the starts of the intervals: each is the decayed one before plus the jump
         decay = np.append(-np.exp(-T[:-1, 0] / tau), 0.0)
         transient = solve_banded((1, 0), np.stack([np.ones_like(decay), decay]),
-                                 np.concatenate([-first[:1], last[:-1] - first[1:]]))
+                                 np.concatenate([-start[:1], end[:-1] - start[1:]]))
         k, s, p = self._cubic(times)
         rate = self.velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
         steady = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
@@ -127,9 +127,9 @@ def _tracking_error(t: Floats, position: Floats, velocity: Floats, times: Floats
         return tau**2 * np.stack([np.sqrt(2) * tau * jerk - 2 * bend[k] - jerk * s, -jerk], 1)
 
     transition = _transition_matrices(np.append(0.0, T[:-1, 0]), tau)
-    first, last = forced_response(slice(None), np.zeros_like(T)), forced_response(slice(None), T)
-    transient = -first
-    transient[1:] += last[:-1]       # error and derivative are continuous where two cubics meet
+    start, end = forced_response(slice(None), np.zeros_like(T)), forced_response(slice(None), T)
+    transient = -start
+    transient[1:] += end[:-1]       # error and derivative are continuous where two cubics meet
     for m in range(1, len(T)):
         transient[m] += transition[m] @ transient[m - 1]
     k = np.clip(np.searchsorted(t, times, side='right') - 1, 0, len(T) - 1)

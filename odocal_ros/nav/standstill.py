@@ -66,8 +66,8 @@ def _spans(at_rest: Bools, edges: Floats, shortest: float) -> Floats:
 def _wheels_at_rest(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
     """Return a mask of cells with little travel around their middles: (m,)."""
     # range of the travel at a few times in the window, so that rocking is detected
-    probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
-    distance = np.max(probes, axis=0) - np.min(probes, axis=0)
+    samples = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
+    distance = np.max(samples, axis=0) - np.min(samples, axis=0)
     return np.asarray(distance * metres_per_unit <= _travel_limit(travel, metres_per_unit))
 
 

@@ -173,8 +173,8 @@ def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every:
     t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
     if not len(t):
         return t, np.empty((0, 4))
-    kept = np.append(np.arange(0, len(t) - 1, every), len(t) - 1)
-    t_out = map_rows(lambda k: t[k], kept)
+    rows = np.append(np.arange(0, len(t) - 1, every), len(t) - 1)
+    t_out = map_rows(lambda k: t[k], rows)
     a, b = (np.append(first, steps) for first, steps in zip(
         _pairs(q_nb0), _products(t, w_b, every, bias), strict=True))
     # n rotates with the Earth relative to the inertial frame that it equals at t[0]

@@ -29,21 +29,21 @@ def running_integral(t: Floats, x: Floats, start: float | Floats = 0.0) -> Float
 def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     """Return the integral of x, (n, ...), from t[0] to rising times (m,): (m, ...)."""
     out, end = np.empty((len(times), *x.shape[1:])), 0.0
-    for some, rows in enclosing_slices(times, t):
+    for chunk, rows in enclosing_slices(times, t):
         integral = running_integral(t[rows], x[rows], end)
         end = integral[-1]
-        out[some] = interpolated(times[some], t[rows], integral)
+        out[chunk] = interpolated(times[chunk], t[rows], integral)
     return out
 
 
 def double_integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     """Return the integral of the integral of x, (n,), at rising times: (m,)."""
     out, end, double_end = np.empty(len(times)), 0.0, 0.0
-    for some, rows in enclosing_slices(times, t):
+    for chunk, rows in enclosing_slices(times, t):
         integral = running_integral(t[rows], x[rows], end)
         double = running_integral(t[rows], integral, double_end)
         end, double_end = integral[-1], double[-1]
-        out[some] = interpolated(times[some], t[rows], double)
+        out[chunk] = interpolated(times[chunk], t[rows], double)
     return out
 
 
@@ -85,9 +85,10 @@ def fit_robust_line(t: Floats, y: Floats) -> tuple[float, float]:
     """Return value at the first time and slope of a line through points, (n,), by medians."""
     if len(t) < 3:
         return float(np.median(y)), 0.0
-    i, j = np.triu_indices(min(len(t), 400), 1)
-    pick = np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int)
-    dt = t[pick][j] - t[pick][i]
+    # median slope of pairs of points that are far apart (Theil and Sen), of at most 400 points
+    points = np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int)
+    i, j = points[np.stack(np.triu_indices(len(points), 1))]
+    dt = t[j] - t[i]
     is_long = dt > (t[-1] - t[0]) / 4
-    slope = float(np.median((y[pick][j] - y[pick][i])[is_long] / dt[is_long]))
+    slope = float(np.median((y[j] - y[i])[is_long] / dt[is_long]))
     return float(np.median(y - slope * (t - t[0]))), slope

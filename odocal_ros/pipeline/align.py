@@ -277,7 +277,7 @@ def _heading_by_course(inputs: Inputs, level: LevelAttitude, metres_per_unit: fl
     selected = (inputs.t_fix >= max(t[0], 0.0)) & (inputs.t_fix <= t[-1])
     if selected.sum() >= 2:
         by_fixes = fixes_n[selected, :2] - fixes_n[selected][0, :2]
-        dead_reckoned = track.at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
+        dead_reckoned = track.P_at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
         dead_reckoned = dead_reckoned - dead_reckoned[0]
         sigma_fix = np.sqrt(np.median(inputs.covariance_n[selected, 0, 0]))
         min_distance = max(COURSE_DISTANCE, 8 * sigma_fix)

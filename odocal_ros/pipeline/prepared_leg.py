@@ -105,7 +105,7 @@ class PreparedLeg(LocatedFixes):
         lever_b = dead_reckoning.axes_from_forward(f) @ self.lever_v
 
         def path_at(t: Floats) -> Floats:
-            path = track.at(t) @ f
+            path = track.P_at(t) @ f
             return path + track.C_nb_at(t) @ lever_b if np.any(lever_b) else path
         return path_at
 

@@ -100,9 +100,9 @@ def _delayed_path(track: Track, f: Floats, lever_b: Floats, delay: float) -> Pat
         t = t - delay
         inside = np.clip(t, track.t[0], track.t[-1])
         outside = np.clip(t - inside, -abs(delay), abs(delay))
-        P = track.at(inside)
+        P = track.P_at(inside)
         onward = 0.2    # s of extrapolation beyond the data, for the delay
-        before = track.at(inside - np.copysign(onward, outside))
+        before = track.P_at(inside - np.copysign(onward, outside))
         P = P + (P - before) * (np.abs(outside) / onward)[..., None, None]
         release_mapped_memory()        # releases the sums before the attitudes are read
         position: Floats = P @ f + track.C_nb_at(inside) @ lever_b

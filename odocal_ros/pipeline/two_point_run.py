@@ -158,7 +158,7 @@ class TwoPointRun:
         if np.isnan(self.config.gnss.correlation_time):     # else configured
             start, end = marks_with_slow_errors(
                 (two_point.start, two_point.end), prepared.standstills, fixes[0],
-                self.track.at(fixes[0]) @ f, two_point.M @ f, residual / factor[0], covariance,
+                self.track.P_at(fixes[0]) @ f, two_point.M @ f, residual / factor[0], covariance,
                 drift_n / factor[0])
             two_point = replace(two_point, start=start, end=end)
         f, _ = solve(two_point, up_scale=factor[2])

@@ -171,7 +171,7 @@ def test_the_plane_of_the_paper_gives_the_expected_column(source):
     K0, truth, path = drive.drive.options.nominal_scale, drive.drive.truth, drive.path()
     screened = screen_leg(drive.drive.leg(), drive.config)
     prepared, _ = prepare(*screened[:2], drive.config, alignment=drive.alignment(source))
-    M = prepared.track.at(prepared.inputs.t_stop) - prepared.track.at(0.0)
+    M = prepared.track.P_at(prepared.inputs.t_stop) - prepared.track.P_at(0.0)
     o, b = np.stack([path.latitude, path.longitude, path.height], -1)[[0, -1]]
     b_dr = prepared.origin.to_geodetic(prepared.origin.to_n(o) + K0 * M @ forward_b(0.0, 0.0))
     K, alpha = by_chords(o, b, b_dr, K0, np.deg2rad(116.0))

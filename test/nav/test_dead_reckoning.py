@@ -60,17 +60,17 @@ def test_conversion_to_the_origin_frame_and_back_is_exact(place):
 
 def test_track_is_interpolated_linearly_and_constant_outside_also_of_one_epoch():
     track = quarter_turn(4)
-    assert_allclose(track.at(track.t), track.P, atol=1e-15)
-    assert_allclose(track.at(3.75), (track.P[1] + track.P[2]) / 2, atol=1e-15)
-    assert_allclose(track.at(np.array([-5.0, 50.0])), track.P[[0, -1]], atol=1e-15)
-    assert track.at(np.zeros((2, 3))).shape == (2, 3, 3, 3)
+    assert_allclose(track.P_at(track.t), track.P, atol=1e-15)
+    assert_allclose(track.P_at(3.75), (track.P[1] + track.P[2]) / 2, atol=1e-15)
+    assert_allclose(track.P_at(np.array([-5.0, 50.0])), track.P[[0, -1]], atol=1e-15)
+    assert track.P_at(np.zeros((2, 3))).shape == (2, 3, 3, 3)
     assert_allclose(track.C_nb_at(np.array([-5.0, 2.4, 2.6, 99.0])), matrix_from_rpy(
         np.outer(np.deg2rad([0, 22.5, 22.5, 90]), [0, 0, 1])), atol=1e-15)
     track = dead_reckon(np.array([3.0]), np.array([[0, 0, 0, 1.0]]),
                         Travel(np.array([0.0, 9.0]), np.array([0.0, 1.0]), 0.0))
     assert isinstance(track, Track)
     for t in (np.array(0.0), np.array(3.0), np.array([1.0, 5.0])):
-        assert_allclose(track.at(t), 0, atol=0)
+        assert_allclose(track.P_at(t), 0, atol=0)
         assert_allclose(track.C_nb_at(t), np.broadcast_to(np.eye(3), (*t.shape, 3, 3)), atol=0)
 
 

@@ -91,7 +91,7 @@ def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Fl
     use = (t_fix >= reach[0]) & (t_fix <= reach[1])
     t, fixes = t_fix[use], np.ascontiguousarray(fixes_n[use, :2])
     forward, origin = forward_b(0.0, pitch), np.array(float(t_start))
-    left, right = (((track.at(t) - track.at(origin)) @ forward)[:, :2] for track in tracks)
+    left, right = (((track.P_at(t) - track.P_at(origin)) @ forward)[:, :2] for track in tracks)
     turn = track_left.C_nb_at(t) - track_left.C_nb_at(origin)
     sigma = np.sqrt((covariance_n[use, 0, 0] + covariance_n[use, 1, 1]) / 2)
     return PlanarLeg(t, left, right, fixes, np.array(start_n[:2], dtype=float), sigma,
