@@ -161,8 +161,8 @@ def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[
 
     def estimate(first: int, last: int) -> _Section:
         part = replace(imu, keyframes=imu.keyframes[first:last + 1])
-        previous_bias = sections[-1].gyro_bias if sections else np.zeros(3)
-        return _estimate_section(leg, part, priors, previous_bias)
+        bias = sections[-1].gyro_bias if sections else np.zeros(3)
+        return _estimate_section(leg, part, priors, bias)
 
     for last in ends[1:]:
         begin, end = imu.t_keyframes[[starts[-1], last]]
@@ -177,12 +177,11 @@ def _estimate_sections(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[
     return sections
 
 
-def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
-                      previous_bias: Floats) -> _Section:
-    """Return a section; previous_bias : (3,) rad/s, gyro bias of the section before it."""
+def _estimate_section(leg: SmootherLeg, imu: ImuSteps, priors: Priors, bias: Floats) -> _Section:
+    """Return a section; bias : (3,) rad/s, gyro bias of the section before it."""
     bias_at_rest = gyro_bias_at_rest(leg, imu)
     if bias_at_rest is None:
-        bias, sigma = previous_bias, np.maximum(priors.gyro_bias_sigma, 1e-3)
+        sigma = np.maximum(priors.gyro_bias_sigma, 1e-3)
     else:       # rad/s, judgement: the drift of a consumer gyro in a leg
         bias, sigma = bias_at_rest, np.full(3, 2e-4)
     count, change = len(imu.keyframes) - 1, np.zeros(3)

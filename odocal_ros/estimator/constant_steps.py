@@ -53,18 +53,18 @@ def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantSte
     rows = weighted[MotionRows]
     path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
     first = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
-    score, matrix, with_others_known = _scores(rows, solved, first)
+    score, matrix, upper_limit = _scores(rows, solved, first)
     information = np.diag(matrix).copy()
     scale = slice(STEP_PLACES)
     score[scale], information[scale] = _with_gradual_change(score[scale], matrix[scale, scale])
     # no information: at rest before or after the place, or a constant that no row depends on
-    has_information = information > 1e-9 * with_others_known
+    has_information = information > 1e-9 * upper_limit
     shape = len(TESTED_CONSTANTS), STEP_PLACES
     sigma = (1 / np.sqrt(np.where(has_information, information, np.inf))).reshape(shape)
     score, t = score.reshape(shape), weighted.state.t[first]
     largest = np.argmax(np.abs(score) * sigma, axis=1)
-    steps = [ConstantStep(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
-                          float(sigma[i, k]))
+    size = score * sigma**2
+    steps = [ConstantStep(constant, float(t[k]), float(size[i, k]), float(sigma[i, k]))
              for i, (constant, k) in enumerate(zip(TESTED_CONSTANTS, largest, strict=True))
              if sigma[i].any()]
     turn = _turn_of_imu(weighted)
@@ -88,24 +88,24 @@ def _turn_of_imu(weighted: Weighted) -> ConstantStep | None:
 
 def _scores(rows: MotionRows, solved: Solved, first: Ints) -> tuple[Floats, Floats, Floats]:
     """
-    Return the scores of L steps, (L,), their information, (L, L), and C' R^-1 C, (L,).
+    Return the scores of L steps, (L,), their information, (L, L), and its upper limit, (L,).
 
     first : intervals in which steps begin. The steps of a constant are adjacent.
     """
     n, L = rows.n, len(TESTED_CONSTANTS) * len(first)
     g, g_constants = work_array(len(rows.r) + 1, n, L), np.zeros((rows.m, L))
     products, score = np.zeros((L, L)), np.zeros(L)
-    for some in blocks(len(rows.r)):
-        J, ends = rows.J[some], slice(some.start + 1, some.stop + 1)
-        after = np.arange(some.start, some.stop)[:, None] >= first
-        C = (J[:, :, [2 * n + i for i in TESTED_CONSTANTS], None] * after[:, None, None]
+    for chunk in blocks(len(rows.r)):
+        J, ends = rows.J[chunk], slice(chunk.start + 1, chunk.stop + 1)
+        is_after = np.arange(chunk.start, chunk.stop)[:, None] >= first
+        C = (J[:, :, [2 * n + i for i in TESTED_CONSTANTS], None] * is_after[:, None, None]
              ).reshape(*J.shape[:2], L)
-        g_some = np.swapaxes(J, 1, 2) @ C
-        g[some] += g_some[:, :n]
-        g[ends] += g_some[:, n:2 * n]
-        g_constants += g_some[:, 2 * n:].sum(axis=0)
+        J_C = np.swapaxes(J, 1, 2) @ C
+        g[chunk] += J_C[:, :n]
+        g[ends] += J_C[:, n:2 * n]
+        g_constants += J_C[:, 2 * n:].sum(axis=0)
         products += (np.swapaxes(C, 1, 2) @ C).sum(axis=0)
-        score -= np.einsum('kil,ki->l', C, rows.r[some])
+        score -= np.einsum('kil,ki->l', C, rows.r[chunk])
     # a shortened step of the fit ends before the minimum of the equations: move the scores to it
     to_minimum = 1 / solved.step_fraction - 1
     score -= to_minimum * (np.einsum('kil,ki->l', g, solved.step)
@@ -121,9 +121,9 @@ def _with_gradual_change(score: Floats, information: Floats) -> tuple[Floats, Fl
     quadratic one. Both have a prior sigma, WARMING_CHANGE, and are eliminated (Schur complement).
     """
     growth = np.linspace(-1.0, 1.0, STEP_PLACES)
-    steps = WARMING_CHANGE / STEP_PLACES * np.stack([growth, np.ones(STEP_PLACES)], -1)
-    cross = information @ steps
-    solution = np.linalg.solve(np.eye(2) + steps.T @ cross,
-                               np.column_stack([cross.T, steps.T @ score]))
+    sigmas = WARMING_CHANGE / STEP_PLACES * np.stack([growth, np.ones(STEP_PLACES)], -1)
+    cross = information @ sigmas
+    solution = np.linalg.solve(np.eye(2) + sigmas.T @ cross,
+                               np.column_stack([cross.T, sigmas.T @ score]))
     return (score - cross @ solution[:, -1],
             np.diag(information) - (cross * solution[:, :-1].T).sum(axis=1))

@@ -44,8 +44,7 @@ class Convergence:
 
 CONVERGENCE = Convergence()
 # definition: weights of the steps of the constants, and sigmas above which a step does not count
-STEP_WEIGHTS = np.where(np.arange(layout.M) < PARAMETER_COUNT, 1.0,
-                        CONVERGENCE.other_weight)
+STEP_WEIGHTS = np.where(np.arange(layout.M) < PARAMETER_COUNT, 1.0, CONVERGENCE.other_weight)
 FLAT_SIGMAS = np.full(layout.M, np.inf)
 FLAT_SIGMAS[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
 
@@ -55,10 +54,10 @@ class Progress:
 
     def __init__(self, fitted: bool, frozen: bool, min_passes: int) -> None:
         """Start; fitted : use fitted signals.   frozen : levels are kept."""
-        self.fitted = self.was_fitted = fitted      # in the next pass, in the last
+        self.fitted = self.was_fitted = fitted      # in the next pass, in the last pass
         self.frozen, self.min_passes, self.converged = frozen, min_passes, False
-        # sigmas of scale and mounting, largest change of their logarithms, the larger of it and of
-        # their largest step in sigmas
+        # scale and mounting: sigmas, largest change of the logarithms of these, larger of this
+        # change and of the largest step in sigmas
         self.sigma, self.change, self.largest_change = np.ones(PARAMETER_COUNT), np.inf, np.inf
         self.largest_step = np.inf      # weighted, of all constants, in sigmas
         self.previous_step = np.zeros(layout.M)     # of the constants, for ``damp_step``

@@ -4,7 +4,7 @@
 """The input of the estimator: one leg as arrays of screened samples (``SmootherLeg``)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -36,8 +36,7 @@ class ExternalSamples:
     def between(self, first: float, last: float) -> Self:
         """Return the samples between two times."""
         inside = (self.t >= first) & (self.t <= last)
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: column[inside] for name, column in columns.items()
+        return replace(self, **{name: column[inside] for name, column in vars(self).items()
                                 if isinstance(column, np.ndarray)})
 
 
@@ -74,9 +73,9 @@ class SmootherLeg:
     w_b: Floats                 # (n, 3) rad/s
     f_b: Floats                 # (n, 3) m/s^2
     travel: Travel
-    t_fix: Floats               # (k,)
+    t_fix: Floats               # (k,) s
     fixes_n: Floats             # (k, 3) m
-    covariance_n: Floats        # (k, 3, 3) m^2, with rounding
+    covariance_n: Floats        # (k, 3, 3) m^2, stated by the receiver, plus rounding
     standstills: Floats         # (s, 2) s, start and end
     rough_scale: float          # metres per unit of travel, with an error of up to 30 %
     nominal_scale: float = 0.0  # K0, 0 unknown
@@ -125,8 +124,7 @@ def drift_time(leg: SmootherLeg, t: Floats) -> Floats:
     distance = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
     if not leg.origin.is_local or (distance > max_robot_speed * T).any():
         return T
-    path = np.max([np.abs(np.diff(wheel.at(t))) for wheel in leg.wheels or (leg.travel,)],
-                  axis=0)
-    at_rest = 0.01      # share of the time, judgement: a pose may change without motion
-    out: Floats = np.maximum(T.sum() * path / max(path.sum(), 1e-12), at_rest * T)
+    path = np.max([np.abs(np.diff(x.at(t))) for x in leg.wheels or (leg.travel,)], axis=0)
+    rest_share = 0.01   # of the time, judgement: a pose may change without motion
+    out: Floats = np.maximum(T.sum() * path / max(path.sum(), 1e-12), rest_share * T)
     return out

@@ -70,13 +70,15 @@ class LevelSteps:
             # levels without a prior have one pseudo-observation, of their current value: with
             # more, the iteration ends at too large a noise
             has_prior = name in PSEUDO_OBSERVATIONS
-            pseudo = PSEUDO_OBSERVATIONS.get(name, 1.0)
+            count = PSEUDO_OBSERVATIONS.get(name, 1.0)
             prior = self._problem.initial_levels[name] / levels[name] if has_prior else 1.0
-            step = float(np.log(np.clip((quadratic + pseudo * prior)
-                                        / (max(expected, 0.0) + pseudo), 0.03, 30.0)))
+            step = float(np.log(np.clip((quadratic + count * prior)
+                                        / (max(expected, 0.0) + count), 0.03, 30.0)))
             first = FIRST_EXPONENT if has_prior or name in SLIP_LEVELS else 1.0
-            move = np.clip(self._exponent(name, step, first) * step, np.log(0.03), np.log(30.0))
-            new[name] = max(levels[name] * float(np.exp(move)), self._problem.min_levels[name])
+            log_ratio = np.clip(self._exponent(name, step, first) * step,
+                                np.log(0.03), np.log(30.0))
+            new[name] = max(levels[name] * float(np.exp(log_ratio)),
+                            self._problem.min_levels[name])
         for name, size in weighted[PriorRows].sizes(marginals).items() if fitted else ():
             step = float(np.log(size / levels[name]))
             new[name] = levels[name] * float(np.exp(min(self._exponent(name, step, 1.0), 1.0)
@@ -110,7 +112,7 @@ def long_span_factors(fixes: Fixes, levels: Levels,
     span = max(1.0, 2 * float(np.median(np.diff(t))))
     while t[-1] - t[0] > MIN_SPANS * span:
         end = np.searchsorted(t, t + span)
-        a = np.flatnonzero(end < len(t))        # differences are those of rows b and a
+        a = np.flatnonzero(end < len(t))        # rows at the starts and ends of the spans
         b = end[a]
         growth = float((1 - np.exp(-(t[b] - t[a]) / time)).mean())
         spans = (t[-1] - t[0]) / span
@@ -119,8 +121,8 @@ def long_span_factors(fixes: Fixes, levels: Levels,
                             for level in (name, white))
             expected = 2 * noise * float(stated[a, columns].mean()) + power * time * growth
             change = error[b, columns] - error[a, columns]
-            chance = 1 + np.sqrt(2 / (spans * change.shape[1]))
-            out[name] = max(out[name], _mean_square(change) / expected / chance)
+            limit = 1 + np.sqrt(2 / (spans * change.shape[1]))      # plus one standard deviation
+            out[name] = max(out[name], _mean_square(change) / expected / limit)
         span *= 2
     return out
 

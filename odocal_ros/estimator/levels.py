@@ -65,7 +65,12 @@ class Levels:
 
 
 class LevelRightHandSides:
-    """The vectors g_i: (N, n, L) of keyframes, (m, L) of constants; q_i' R^-1 q_j: (L, L)."""
+    """
+    The right-hand sides of L levels, summed over the factors.
+
+    g : (N, n, L) rows of the keyframes of g_i.   g_constants : (m, L) rows of the constants.
+    q_products : (L, L) q_i' R^-1 q_j.
+    """
 
     def __init__(self, N: int, n: int, m: int, names: Iterable[str]) -> None:
         self.names = tuple(names)

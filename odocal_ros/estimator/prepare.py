@@ -66,22 +66,21 @@ def make_smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: F
         fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
     earlier = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = min(0.0, float(earlier[-1][0])) if earlier else 0.0
-    kept = thinning(inputs.t_fix, FIX_RATE)
+    rows = thinning(inputs.t_fix, FIX_RATE)
+    imu_arm, odometer_arm, antenna_arm = (np.array(group.lever_arm, float) for group in (
+        config.imu, config.odometer, config.gnss))
     return SmootherLeg(
         origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
-        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel.smoothed(), t_fix=inputs.t_fix[kept],
-        fixes_n=fixes_n[kept], covariance_n=inputs.covariance_n[kept],
-        rounding_n=inputs.rounding_n[kept],
-        standstills=np.asarray(spans), rough_scale=float(rough_scale),
-        nominal_scale=nominal_scale(config, inputs.scale_unit),
-        scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),
-        odometer_arm=np.array(config.odometer.lever_arm, float),
-        antenna_arm=np.array(config.gnss.lever_arm, float),
-        uncertain_t=inputs.uncertain_t, uncertain_sigma=inputs.uncertain_sigma,
+        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel.smoothed(), t_fix=inputs.t_fix[rows],
+        fixes_n=fixes_n[rows], covariance_n=inputs.covariance_n[rows],
+        rounding_n=inputs.rounding_n[rows], standstills=np.asarray(spans),
+        rough_scale=float(rough_scale), nominal_scale=nominal_scale(config, inputs.scale_unit),
+        scale_unit=inputs.scale_unit, imu_arm=imu_arm, odometer_arm=odometer_arm,
+        antenna_arm=antenna_arm, uncertain_t=inputs.uncertain_t,
+        uncertain_sigma=inputs.uncertain_sigma,
         external={kind.name: samples for kind in EXTERNAL_FACTORS
                   if (samples := kind.prepared(inputs, config, origin)) is not None},
-        has_accelerometer=inputs.has_accelerometer,
-        wheels=inputs.travels)
+        has_accelerometer=inputs.has_accelerometer, wheels=inputs.travels)
 
 
 def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
@@ -93,7 +92,8 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
     config = replace(config, imu=with_grade_by_noise(
         config.imu, white_noise_at_rest(imu, leg, at_rest)))
     grade = grade_of(config.imu)
-    grade = grade if leg.has_accelerometer else without_accelerometer(grade)
+    if not leg.has_accelerometer:
+        grade = without_accelerometer(grade)
     external = {name: samples.between(t[0], t[-1]) for name, samples in leg.external.items()}
     unshared_constants = {kind.source: kind.constants for kind in EXTERNAL_FACTORS
                           if kind.name in leg.external and kind.name not in SHARED}
@@ -114,7 +114,7 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
             problem.initial_levels = problem.initial_levels.replaced(**initial)
             problem.min_levels |= minimum
     # samples also contain vibration, most of which cancels within a second: the fit starts with
-    # it, and decreases the levels
+    # the noise of samples, and decreases the levels
     rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
     problem.vibrating_levels = {name: max(sigma**2, problem.initial_levels[name])
                                 for name, sigma in sample_noise(leg, rows).items()}
@@ -125,7 +125,7 @@ def imperfection_sigmas(grade: Grade) -> Floats:
     """
     Return the usual sigmas of the constants IMPERFECTIONS, 0 without this error: (k,).
 
-    Errors of the IMU are by its grade. Receivers that smooth do so over a second. Most have no
+    Those of the IMU are from its grade. Receivers that smooth do so over a second. Most have no
     odometer: its usual error is small, with a wide range (SIZE_SPREADS). Clocks differ by
     20 ppm. The scale of tyres changes by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within
     about ten minutes, and by slip of 0.4 % for each m/s^2. The path of an axle differs from that
@@ -175,14 +175,15 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     sigma[layout.LIFT], sigma[layout.MEAN_ROLL] = LIFT_SIGMA, MEAN_ROLL_SIGMA
     height_sigma = np.sqrt(np.median(leg.covariance_n[:, 2, 2])) if len(leg.t_fix) else 0.0
     sigma[layout.HEIGHT_DRIFT] = max(height_sigma / HEIGHT_TIME, layout.NO_ERROR)
-    constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)
+    is_constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)
     # definition: 1, as the error is in stated sigmas; if these are constant it has no effect
-    sigma[layout.FIX_ERROR_BY_SIGMA] = np.where(constant, layout.NO_ERROR, 1.0)
+    sigma[layout.FIX_ERROR_BY_SIGMA] = np.where(is_constant, layout.NO_ERROR, 1.0)
     # physical: receivers with an odometer trust it for 5 to 60 s
     mean[layout.FIX_MOTION_TIME], sigma[layout.FIX_MOTION_TIME] = np.log(20.0), 0.7
     # offset of a coarse speed: 0 (rounded) to half a step (truncated)
-    half = leg.travel.coarse.truncation / 2 if leg.travel.coarse else 0.0
-    mean[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = half, half or layout.NO_ERROR
+    middle = leg.travel.coarse.truncation / 2 if leg.travel.coarse else 0.0
+    mean[layout.SPEED_OFFSET] = middle
+    sigma[layout.SPEED_OFFSET] = middle if middle else layout.NO_ERROR
     for kind in EXTERNAL_FACTORS:
         samples = leg.external.get(kind.name)
         sigma[kind.constants] = (

@@ -50,8 +50,8 @@ def separate_tilts(tilt: Floats, acceleration: Floats, path: Floats) -> tuple[Fl
     tilt : (N,) rad, of the body in n.   acceleration : (N,) m/s^2, along the axis that tilts up.
     path : (N,) weights of means.
     """
-    # of body = c (acceleration + G * of ground) + bumps: springs also react to gravity on a slope.
-    # c > 0: ground that leans into turns is a bank
+    # tilt of the body = c (acceleration + G * tilt of the ground) + bumps: springs also react to
+    # gravity on a slope. c > 0: ground that leans into turns is a bank
     share = path / max(path.sum(), 1e-9)
     deviation = acceleration - share @ acceleration
     by_force = max(share @ (deviation * tilt), 0.0) / max(share @ deviation**2, 1e-9)
@@ -93,8 +93,7 @@ class Axle:
         # not by the attitude, which contains the pitch mounting angle
         speed, up = self._forward_speed(self.v_n), self.v_n[:, 2]
         double_speed = speed[1:] + speed[:-1]
-        return (up[1:] + up[:-1]) * double_speed / np.maximum(double_speed**2,
-                                                              (2 * WALK_SPEED)**2)
+        return (up[1:] + up[:-1]) * double_speed / np.maximum(double_speed**2, (2 * WALK_SPEED)**2)
 
     def body_pitch(self) -> Floats:
         """Return the pitch of the body on its springs at the keyframes, nose up: (N,) rad."""

@@ -178,8 +178,7 @@ class IntervalNoise:
         """Return the covariances of some intervals, (k, 18, 18); units : effects in sigmas."""
         Q = units @ np.swapaxes(units, 1, 2)
         known = self.known_columns[rows]
-        if known.shape[2]:
-            Q += known @ np.swapaxes(known, 1, 2)
+        Q += known @ np.swapaxes(known, 1, 2)
         Q[:, range(ROWS), range(ROWS)] += self.known_variances[rows]
         return Q
 
@@ -189,9 +188,8 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     """
     Return the noises of a motion.
 
-    rest : (K,) intervals at standstill: their odometer noise is known, since it does not depend on
-        the noise in motion.
-    variance_factors : (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals.
+    rest : (K,) intervals at standstill, whose odometer noise is known: it is independent of that
+    in motion.   variance_factors : (K, VARIANCE_FACTOR_COUNT) of outlier intervals; None: 1.
     """
     K, T = len(motion.T), motion.T[:, 0]
     axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up
@@ -199,11 +197,11 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
     speed = np.linalg.norm(motion.displacement, axis=1) / T
     root_path = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero if a wheel hardly turns
-    hard, turning = accelerating_and_turning(motion)
-    variance_factors = np.ones(
-        (K, VARIANCE_FACTOR_COUNT)) if variance_factors is None else variance_factors
-    magnitudes = (root_path * ~hard, root_path * hard, root_path * ~turning, root_path * turning,
-                  root_path, np.sqrt(2 * motion.half_pitch_variance))
+    accelerating, turning = accelerating_and_turning(motion)
+    if variance_factors is None:
+        variance_factors = np.ones((K, VARIANCE_FACTOR_COUNT))
+    magnitudes = (root_path * ~accelerating, root_path * accelerating, root_path * ~turning,
+                  root_path * turning, root_path, np.sqrt(2 * motion.half_pitch_variance))
     road = np.stack([magnitude * ~rest * np.sqrt(variance_factors[:, axis])
                      for axis, magnitude in zip(ROAD.values(), magnitudes, strict=True)], -1)
     known_variances = _known_variances(motion, leg)
@@ -256,8 +254,7 @@ def accelerating_and_turning(motion: Motion) -> tuple[Bools, Bools]:
     speed = np.einsum('ki,ki->k', motion.displacement, (motion.f_n + motion.f_n_end) / 2) \
         / motion.state.scale / T
     padded = np.pad(speed, 1, mode='edge')
-    hard = np.abs(padded[2:] - padded[:-2]) > 0.5 * 2 * T
-    return hard, motion.turning > TURNING_RATE
+    return np.abs(padded[2:] - padded[:-2]) > 0.5 * 2 * T, motion.turning > TURNING_RATE
 
 
 def _known_variances(motion: Motion, leg: SmootherLeg) -> Floats:
@@ -275,8 +272,8 @@ def _known_variances(motion: Motion, leg: SmootherLeg) -> Floats:
     outside = (stamp[:-1] < travel.t[0]) | (stamp[1:] > travel.t[-1])
     variances[outside, D] = ABSENT_VARIANCE
     variances[:, D] += _gap_variances(stamp, travel, motion.state.scale)[:, None]
-    for at, sigma in zip(leg.uncertain_t, leg.uncertain_sigma, strict=True):
-        k = np.searchsorted(t, at) - 1
+    for t_step, sigma in zip(leg.uncertain_t, leg.uncertain_sigma, strict=True):
+        k = np.searchsorted(t, t_step) - 1
         if 0 <= k < len(T) and sigma > 0:
             intervals = slice(max(k - 1, 0), k + 2)       # the gap may begin one interval earlier
             variances[intervals, D] += (motion.state.scale * sigma)**2

@@ -51,8 +51,9 @@ class MotionRows(Factor):
         self.motion = Motion(problem, point.state, point.intervals, point.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
         self.signals = Signals(self.motion)
-        rest = problem.at_rest[:-1] & problem.at_rest[1:]
-        self.noise = interval_noise(self.motion, problem.leg, rest, point.variance_factors)
+        intervals_at_rest = problem.at_rest[:-1] & problem.at_rest[1:]
+        self.noise = interval_noise(self.motion, problem.leg, intervals_at_rest,
+                                    point.variance_factors)
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
@@ -183,17 +184,16 @@ class MotionRows(Factor):
         return self._noise_estimates[1:]
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        units, known = [], []
+        by_unit, by_known = [], []
         for rows, block in zip(blocks(len(self.r)), marginals.blocks(), strict=True):
-            cross = self.parameter_covariances(block)
-            by_rows = cross @ np.swapaxes(self.J[rows], 1, 2)
-            units.append(by_rows @ self.units(rows))
-            known.append(by_rows @ (self.whiten[rows] @ self.noise.known_columns[rows]))
-        X = np.concatenate(units)
+            by_rows = self.parameter_covariances(block) @ np.swapaxes(self.J[rows], 1, 2)
+            by_unit.append(by_rows @ self.units(rows))
+            by_known.append(by_rows @ (self.whiten[rows] @ self.noise.known_columns[rows]))
+        effects = np.concatenate(by_unit)
         for name in INTERVAL:
-            yield NAMES[name], X[:, :, self.noise_mask(name)]
+            yield NAMES[name], effects[:, :, self.noise_mask(name)]
         if self.noise.known_columns.shape[2]:
-            yield SpeedSteps.source, np.concatenate(known)
+            yield SpeedSteps.source, np.concatenate(by_known)
 
     def road_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """Return odometer noise forward, left, up, in sigmas, and its variances: (K, 3) each."""

@@ -90,23 +90,24 @@ class PriorRows(factor.Factor):
         """
         Return the size of each kind of imperfections, given all other unknowns, (S29).
 
-        It is the mean of the posterior. An imperfection is weighted by the share of the drive in
-        its information; otherwise model errors would change the size of one that is hardly
-        observable. For a rare effect, with a wide prior, it is the most likely size: the mean
-        would be that of the few vehicles with this effect.
+        It is the mean of the posterior, or for a rare effect, with a wide prior, its maximum: the
+        mean would be that of the few vehicles with this effect. An imperfection is weighted by the
+        share of the drive in its information; otherwise model errors would change the size of an
+        imperfection that is hardly observable.
         """
-        at = 2 * self.n + np.arange(layout.IMPERFECTIONS.start, layout.IMPERFECTIONS.stop)
+        rows = 2 * self.n + np.arange(layout.IMPERFECTIONS.start, layout.IMPERFECTIONS.stop)
         usual = self.usual_priors.sigma[layout.IMPERFECTIONS]**2
         weight = 1 / self.priors.sigma[layout.IMPERFECTIONS]**2
-        total = 1 / marginals[0][at, at]
-        data = np.maximum(total - weight, 1e-9 * total)     # the share is below rounding
-        known = data / (data + 1 / (SIZE * usual))
+        # information in total and from the drive, and the share of the latter
+        total = 1 / marginals[0][rows, rows]
+        data = np.maximum(total - weight, 1e-9 * total)     # smaller differences are rounding
+        share = data / (data + 1 / (SIZE * usual))
         z2 = (self._deviations()[layout.IMPERFECTIONS] * total / data)**2
         variance = np.exp(LOG_SIZES)[:, None] * usual + 1 / data
         kinds = np.eye(len(SIZES))[layout.KIND_OF]
         spread = np.array([SIZE_SPREADS[name] for name in SIZES])
         # -2 ln of the posterior density, for each value of LOG_SIZES and each kind
-        cost = (known * (z2 / variance + np.log(variance))) @ kinds + (
+        cost = (share * (z2 / variance + np.log(variance))) @ kinds + (
             (LOG_SIZES[:, None] - np.log(SIZE)) / spread)**2
         most_likely = np.exp(LOG_SIZES[np.argmin(cost, axis=0)])
         mean = np.average(np.broadcast_to(np.exp(LOG_SIZES)[:, None], cost.shape), axis=0,

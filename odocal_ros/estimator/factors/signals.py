@@ -75,7 +75,7 @@ class Signals:
         gyro : as above.   estimates : (k, 3 p) of these unit noises. The result is (k, 3, a) each.
         """
         part = self.motion.take(rows)
-        k, C = len(part.C), part.C[:, None]
+        k, C = len(part.C), part.C[:, None]      # number of intervals, attitudes
         # effects on the rows of the estimated noise about each axis of b
         by_gyro = ((gyro.reshape(k, ROWS, -1, 3) @ C)
                    * (estimates.reshape(k, 1, -1, 3) @ C)).sum(2)

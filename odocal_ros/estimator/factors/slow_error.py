@@ -84,7 +84,7 @@ class SlowError(factor.Factor):
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         i, s = np.arange(SLOW.start, SLOW.stop), self.state.slow_n
         a, q, r = self.decay, self.noise_variance, self.residual()
-        before, both, variance = self._variances(marginals)
+        before, cross, variance = self._variances(marginals)
         square, redundancy = r**2 / q, 1 - variance / q
         first, first_variance = s[0]**2 / self.variance, marginals[0][i, i] / self.variance
         squares = square.sum(axis=0) + first
@@ -93,15 +93,19 @@ class SlowError(factor.Factor):
                       'slow_up': (float(squares[2]), float(expected[2]))}
         if not self.time_is_fixed:
             components['correlation_time'] = self._time(
-                r * s[:-1] + both - a * before, square - redundancy, first + first_variance - 1)
+                r * s[:-1] + cross - a * before, square - redundancy, first + first_variance - 1)
         return components
 
     def _variances(self, marginals: JointMarginals) -> tuple[Floats, Floats, Floats]:
-        """Return (co)variances of the error before, it and that after, driving noise: (K, 3)."""
+        """
+        Return variances (K, 3) of the error at the start of an interval and of its driving noise.
+
+        Between them: the covariance of the errors at the start and the end.
+        """
         variances, a = marginals.variances()[:, SLOW], self.decay
         before, after = variances[:-1], variances[1:]
-        both = marginals.next_covariances()[:, SLOW]
-        return before, both, after + a**2 * before - 2 * a * both
+        cross = marginals.next_covariances()[:, SLOW]
+        return before, cross, after + a**2 * before - 2 * a * cross
 
     def jumps(self, marginals: JointMarginals) -> Floats:
         """

@@ -130,7 +130,8 @@ def _convergence_texts(fit: Fit) -> tuple[dict[str, str], float]:
     """Return text and remedy of a fit that has not converged, and its last step in sigmas."""
     if not fit.slowly_converging and fit.converged:
         return {}, 0.0
-    step = last_step(fit)
+    steps = fit.solved.step_constants / np.sqrt(np.diag(fit.solved.covariance))
+    step = float(np.abs(steps[:PARAMETER_COUNT]).max())      # of scale, yaw and pitch
     return {f'after {fit.iterations} iterations ' + (
         f'the estimates still changed by {step:.2g} sigma '
         f'(limit {CONVERGENCE.max_final_step:g})'
@@ -176,12 +177,6 @@ def _accelerometer_outlier_reasons(fit: Fit) -> list[Reason]:
         'down-weighted',
         'Likely cause: vibration above half the rate of the IMU (aliasing), or shocks. Use the '
         'low-pass filter of the IMU or a higher rate, and mount it firmly.')]
-
-
-def last_step(fit: Fit) -> float:
-    """Return the largest step of scale, yaw and pitch in the last pass, in sigmas."""
-    step = fit.solved.step_constants / np.sqrt(np.diag(fit.solved.covariance))
-    return float(np.abs(step[:PARAMETER_COUNT]).max())
 
 
 def _heading_reasons(heading: ExternalSamples | None, error: float) -> list[Reason]:
@@ -233,9 +228,11 @@ def find_noise_cause(problem: Problem, level: dict[str, float], noisy: list[str]
                      f'{", ".join(vibrating.values())}. Mount the IMU firmly and away from '
                      'engine and motors.')
     if quantised:
-        texts.insert(0, f'{_cause_of(quantised, noisy)} is quantisation: '
-                     f'{_steps_in_words(quantised)}. Set a finer resolution or a smaller range in '
-                     'the IMU or its driver, if there is one.')
+        steps = ' and '.join(f'the {NAMES[name]} has steps of ' + (
+            f'{np.rad2deg(step):.3g} deg/s' if name == 'gyro' else f'{step:.3g} m/s^2')
+            for name, step in quantised.items())
+        texts.insert(0, f'{_cause_of(quantised, noisy)} is quantisation: {steps}. Set a finer '
+                     'resolution or a smaller range in the IMU or its driver, if there is one.')
     return ' '.join(texts)
 
 
@@ -261,13 +258,6 @@ def sample_noise_by_motion(problem: Problem) -> tuple[dict[str, float], dict[str
     in_motion, at_rest = (np.flatnonzero(kinds == kind)[:MAX_NOISE_SAMPLES] for kind in (0, 1))
     return (sample_noise(leg, in_motion) if len(in_motion) >= MIN_NOISE_SAMPLES else {},
             sample_noise(leg, at_rest) if len(at_rest) >= MIN_NOISE_SAMPLES else {})
-
-
-def _steps_in_words(steps: dict[str, float]) -> str:
-    return ' and '.join(
-        f'the {NAMES[name]} has steps of ' + (
-            f'{np.rad2deg(step):.3g} deg/s' if name == 'gyro' else f'{step:.3g} m/s^2')
-        for name, step in steps.items())
 
 
 def find_quantisation_steps(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:

@@ -53,10 +53,11 @@ def stored_residuals(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, 
     """
     Return the residuals of each sensor, fitted less measured, and the sigmas of its noise.
 
-    By name, (n, 6), three residuals and their sigmas; NaN: no data. For each interval, at its end:
-    ``residual_odometer`` forward, left, up, m; ``residual_gyro`` and ``residual_accelerometer``,
-    means in b, rad/s and m/s^2. ``residual_fix``, for each fix used, at ``residual_fix_t``, s:
-    east, north, up, m, without the time-correlated error. Single precision, to save memory.
+    Arrays by name, (n, 6): three residuals and their sigmas; NaN: no data. For each interval, at
+    its end: ``residual_odometer`` forward, left, up, m; ``residual_gyro`` and
+    ``residual_accelerometer``, means in b, rad/s and m/s^2. ``residual_fix``, for each used fix,
+    at ``residual_fix_t``, s: east, north, up, m, without the time-correlated error. Single
+    precision, to save memory.
     """
     residuals = {**_interval_residuals(fit), 'fix': _fix_residuals(fit)}
     return {f'residual_{name}': np.concatenate(pair, axis=1).astype(np.float32)
