@@ -144,9 +144,10 @@ def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
     """Return a function that makes fixes from stamps, arrivals, positions and covariances."""
     def build(stamps: Ints, received: Ints, position: Floats, *covariance: Floats) -> FixSamples:
         n = len(stamps)
-        kind = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
+        # covariance type of NavSatFix: 3 known, 0 unknown; zeros and negative ones are unknown too
+        covariance_type = np.full(n, 3 if covariance else 0)
         covariance_n = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
         geodetic = geodetic_from_local(position, latitude_deg)
-        return from_columns(FixSamples, stamps, received, *geodetic, covariance_n, kind,
-                            np.full(n, LOCAL_STATUS))
+        return from_columns(FixSamples, stamps, received, *geodetic, covariance_n,
+                            covariance_type, np.full(n, LOCAL_STATUS))
     return build

@@ -101,14 +101,15 @@ def _from_orientations(inputs: Inputs, t: Floats, q: Floats, variance: Floats, o
     q : (m, 4) orientations.   variance : (m,) rad^2, of the yaw, NaN: not published.   offset :
     rad, added to the yaw.   C_ib : from b to the published frame.
     """
-    good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
-    t, q, variance = t[good], q[good], variance[good]
+    # a quaternion of zeros is not a published orientation
+    is_published = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
+    t, q, variance = t[is_published], q[is_published], variance[is_published]
     if len(t) < 2 or not len(inputs.t_fix):
         return None
-    kept = thinning(t)
-    t, q, variance = t[kept], q[kept], variance[kept]
-    stated = float(np.median(variance))
-    sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
+    rows = thinning(t)
+    t, q, variance = t[rows], q[rows], variance[rows]
+    stated_variance = float(np.median(variance))
+    sigma = np.sqrt(stated_variance) if stated_variance > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
         return None
     C = matrix_from_quat(q) @ C_ib

@@ -53,8 +53,8 @@ class PressureRows(ExternalRows):
         samples, t = inputs.external['pressure']
         if not (config.imu.use_pressure and len(t) and inputs.has_accelerometer):
             return None
-        cell = np.floor(t * RATE)
-        first = np.r_[0, np.flatnonzero(np.diff(cell)) + 1]
+        # means of the samples in each cell of 1 / RATE
+        first = np.r_[0, np.flatnonzero(np.diff(np.floor(t * RATE))) + 1]
         count = np.diff(np.r_[first, len(t)])
         t_mean, p_mean, v_mean = (np.add.reduceat(x, first) / count
                                   for x in (t, samples.value, samples.variance))
@@ -70,8 +70,7 @@ class PressureRows(ExternalRows):
              leg: SmootherLeg) -> tuple[Floats, Floats, Floats]:
         state, k, tau = point.state, points.interval, points.tau
         C, g = state.C_nb[k], gravity_n(state.p_n[k], leg.origin)
-        dp = rotate(C, points.dp)
-        dv = rotate(C, points.dv)
+        dp, dv = rotate(C, points.dp), rotate(C, points.dv)
         velocity_n = state.v_n[k] + dv + g * tau[:, None]
         by_velocity = (2 * state.constants[PRESSURE][2] * velocity_n)[:, None]
         by_constants = np.stack([np.ones(len(k)), samples.t, (velocity_n**2).sum(axis=1),

@@ -11,6 +11,7 @@ maximise the restricted likelihood. Outliers have a larger variance.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -39,8 +40,8 @@ class Increments:
     prior: Floats      # (p,) prior sigmas of x, inf: none
     mean: Floats       # (p,) prior means of x
     reading: float     # m^2, initial variance of the reading error at a node
-    walk_time: Floats  # (k,) s, variance of the walk in each increment over its level
-    kind: Ints         # (k,) index of its level: 0 constant speed, 1 acceleration, 2 turns
+    walk_time: Floats  # (k,) s, variance of the walk in each increment over the level of its kind
+    kind: Ints         # (k,) index in ``walk``: 0 constant speed, 1 acceleration, 2 turns
     walk: Floats       # (3,) m^2/s, initial levels
 
 
@@ -54,44 +55,53 @@ class Regression:
     gain: Floats        # (p, k) derivatives of x by y
 
 
+class _Solution(NamedTuple):
+    """The estimate of x at given levels."""
+
+    x: Floats           # (p,)
+    covariance: Floats  # (p, p)
+    cost: float         # -2 ln likelihood, plus a constant
+    banded: Floats      # (2, k) covariance of y: the diagonal above the main one, the main one
+    root: Floats        # (2, k) its Cholesky factor
+
+
 def fit_regression(data: Increments) -> Regression:
     """Return the estimate at the maximum of the restricted likelihood, (W6), without outliers."""
     from scipy.optimize import minimize
     factor = np.ones(len(data.y))      # on the variances of outliers, u of (W7)
     log_levels = np.zeros(len(data.walk) + 1)
+    corners = -2 * np.eye(len(log_levels) + 1)[:, 1:]      # of the first simplex, less its origin
     for _ in range(MAX_OUTLIER_PASSES):
-        simplex = log_levels + np.concatenate([np.zeros((1, len(log_levels))), -2 * np.eye(
-            len(log_levels))])
-        minimum = minimize(_minus_log_likelihood, log_levels, args=(data, factor),
-                           method='Nelder-Mead', options={
-                               'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': simplex})
+        minimum = minimize(
+            _minus_log_likelihood, log_levels, args=(data, factor), method='Nelder-Mead',
+            options={'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': log_levels + corners})
         log_levels = np.maximum(minimum.x, MIN_LOG_LEVEL)
-        x, covariance, _, banded, root = _solve(log_levels, data, factor)
-        z = _leave_one_out(banded, root, data.y - data.X @ x)
+        fitted = _solve(log_levels, data, factor)
+        z = _leave_one_out(fitted.banded, fitted.root, data.y - data.X @ fitted.x)
         before, factor = factor, np.maximum(factor * (z / TAIL_SIGMAS)**2, 1.0)
         if np.allclose(factor, before, rtol=OUTLIER_TOLERANCE):
             break
-    gain = covariance @ cho_solve_banded((root, False), data.X, check_finite=False).T
-    return Regression(x, covariance, data.walk * np.exp(log_levels[:-1]), gain)
+    gain = fitted.covariance @ cho_solve_banded(
+        (fitted.root, False), data.X, check_finite=False).T
+    return Regression(fitted.x, fitted.covariance, data.walk * np.exp(log_levels[:-1]), gain)
 
 
-def _solve(log_levels: Floats, data: Increments,
-           factor: Floats) -> tuple[Floats, Floats, float, Floats, Floats]:
-    """Return x, its covariance, -2 ln likelihood, and the banded covariance of y and its root."""
+def _solve(log_levels: Floats, data: Increments, factor: Floats) -> _Solution:
+    """Return the solution; factor : (k,) on the variances of outliers."""
     levels = np.exp(np.maximum(log_levels, MIN_LOG_LEVEL))
     reading = data.reading * levels[-1]
     walk = (data.walk * levels[:-1])[data.kind] * data.walk_time * factor
     banded = np.empty((2, len(data.y)))
     banded[0], banded[1] = -reading, walk + 2 * reading
     root = cholesky_banded(banded, check_finite=False)
-    both = np.column_stack([data.X, data.y - data.X @ data.mean])
-    inverse = both.T @ cho_solve_banded((root, False), both, check_finite=False)
-    information = inverse[:-1, :-1] + np.diag(1 / data.prior**2)
+    columns = np.column_stack([data.X, data.y - data.X @ data.mean])
+    products = columns.T @ cho_solve_banded((root, False), columns, check_finite=False)
+    information = products[:-1, :-1] + np.diag(1 / data.prior**2)
     covariance = np.linalg.inv(information)
-    step = covariance @ inverse[:-1, -1]
-    cost = (2 * np.log(root[1]).sum() + np.linalg.slogdet(information)[1] + inverse[-1, -1]
+    step = covariance @ products[:-1, -1]
+    cost = (2 * np.log(root[1]).sum() + np.linalg.slogdet(information)[1] + products[-1, -1]
             - step @ information @ step)
-    return data.mean + step, covariance, float(cost), banded, root
+    return _Solution(data.mean + step, covariance, float(cost), banded, root)
 
 
 def _minus_log_likelihood(log_levels: Floats, data: Increments, factor: Floats) -> float:
@@ -100,7 +110,7 @@ def _minus_log_likelihood(log_levels: Floats, data: Increments, factor: Floats) 
     differences = walk - walk.mean()
     prior = (walk.mean()**2 / WALK_SPREAD**2 + (differences**2).sum() / WALK_DIFFERENCE_SPREAD**2
              + reading**2 / READING_SPREAD**2)
-    return (_solve(log_levels, data, factor)[2] + float(prior)) / 2
+    return (_solve(log_levels, data, factor).cost + float(prior)) / 2
 
 
 def _leave_one_out(banded: Floats, root: Floats, residual: Floats) -> Floats:
