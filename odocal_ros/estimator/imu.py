@@ -7,7 +7,7 @@ IMU samples of a leg: their sums over steps of a tenth of a second, and their no
 A step has the rotation vector, and the single and double integral of the specific force in the
 axes at its start, with coning and sculling at the sample rate (two-speed strapdown, Savage 1998).
 The passes of a fit integrate steps instead of samples: errors of the IMU are constant within a
-step. The noise functions return sigmas by the grade of the IMU, and by standstills or samples.
+step. The noise functions return sigmas from the grade of the IMU, standstills or samples.
 """
 
 from dataclasses import dataclass, replace
@@ -41,8 +41,9 @@ from odocal_ros.settings.nominal import G, Grade
 STEP = 0.1
 # judgement: samples, so that their arrays stay in the cache; keyframes, which limits the memory
 SAMPLES_IN_CACHE, KEYFRAMES_IN_CACHE = 8192, 64
-# judgement, without an accelerometer: white noise, m/s^2/sqrt(Hz), by vehicle accelerations of
-# 1.5 m/s^2 for some seconds; random walk, m/s^2/sqrt(s), by slopes of a few per cent over a minute
+# judgement, without an accelerometer: white noise, m/s^2/sqrt(Hz), for vehicle accelerations of
+# 1.5 m/s^2 for some seconds; random walk, m/s^2/sqrt(s), for slopes of a few per cent over a
+# minute
 NO_ACCEL_NOISE, NO_ACCEL_WALK = 5.0, 0.01
 # lower limits: white noises, rad/s and m/s^2 per sqrt(Hz), and walks of the biases, the same per
 # sqrt(s). Physical: a tenth of navigation grade, since a sensor with a dead band has none at rest

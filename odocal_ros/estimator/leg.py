@@ -90,7 +90,7 @@ class SmootherLeg:
     external: Mapping[str, ExternalSamples] = field(default_factory=dict)
     wheels: tuple[Travel, ...] = ()     # single wheels, in the order of odometer.wheels
     has_accelerometer: bool = True      # False: f_b is constant gravity
-    # (k, 3) or (1, 3) m^2, part of ``covariance_n`` by rounding of the positions
+    # (k, 3) or (1, 3) m^2, part of ``covariance_n`` from rounding of the positions
     rounding_n: Floats = field(default_factory=lambda: np.zeros((1, 3)))
 
     @property

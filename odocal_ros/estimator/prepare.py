@@ -46,7 +46,7 @@ LIFT_SIGMA = 0.02
 # m, each axis, lower limits of the white and of the correlated error of fixes and of poses.
 # Physical: the best receivers of today, motion capture
 MIN_FIX_NOISE, MIN_POSE_NOISE = 0.005, 2e-4
-# s, physical: height errors by ionosphere and orbits change by one sigma in this time
+# s, physical: height errors from ionosphere and orbits change by one sigma in this time
 HEIGHT_TIME = 900.0
 
 

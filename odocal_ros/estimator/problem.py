@@ -28,7 +28,7 @@ class Problem:
 
     leg: SmootherLeg
     imu: ImuSteps            # IMU samples as sums over steps of 0.1 s; the keyframes
-    grade: Grade             # of the IMU, as configured or by its noise at rest
+    grade: Grade             # of the IMU, as configured or from its noise at rest
     priors: Priors           # docs/method.md (S21)
     used_fixes: np.ndarray   # (k,) bool, fixes of the leg between first and last keyframe
     fix_whitening: np.ndarray     # (m, 3, 3) inverse Cholesky factors of the stated covariances

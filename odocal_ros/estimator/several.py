@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The result of several legs of one vehicle, by the joint estimate of their marginals."""
+"""The result of several legs of one vehicle, from the joint estimate of their marginals."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,8 +35,8 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, REMARK_SIGMAS
 from odocal_ros.settings.nominal import grade_of
 
-# usual scatter of ln K, yaw and pitch between the legs of a vehicle: 20 ppm by tyres, 2 and 5 mdeg
-# by load and the cross slopes of roads. Judgement
+# usual scatter of ln K, yaw and pitch between the legs of a vehicle: 20 ppm from tyres, 2 and 5
+# mdeg from load and the cross slopes of roads. Judgement
 SCATTER = 2e-5, 3.5e-5, 8.7e-5
 DELAY_REMEDY = ('A delay changed between the legs, not the vehicle. Check the clocks and the '
                 'time stamps of this sensor: driver restarts, buffering, clock synchronisation.')

@@ -104,14 +104,14 @@ FAST_SPEED = 20.0           # m/s, definition: at which the slope is stated, a c
 # if the axle keeps its direction, 0 if it follows the body, negative if bumps are shorter than the
 # wheelbase
 SCALE_BY_PITCHING = CONSTANTS.index('scale_by_pitching')
-# pitch and yaw of the forward axis by forward and left acceleration, rad per m/s^2, and by their
-# rates of change, rad per m/s^3, (S12): the body reacts with a delay, tyres immediately
+# pitch and yaw of the forward axis due to forward and left acceleration, rad per m/s^2, and by
+# their rates of change, rad per m/s^3, (S12): the body reacts with a delay, tyres immediately
 BODY_LEAN = constants_from('squat', 'sideslip_by_jerk')
-# displacements of the axle by the tilt of the body, (S12): points about which it pitches, m ahead
-# of the odometer: on hills; in addition on bumps; in turns about its own left axis, on banked
-# ground. Height above the odometer, m, of the centre about which it tilts on its springs; its sway
-# there by lateral force, m per m/s^2. Lift of the axle by turns, m/rad: the third point times the
-# mean roll of the ground, (S12)
+# displacements of the axle due to the tilt of the body, (S12): points about which it pitches, m
+# ahead of the odometer: on hills; in addition on bumps; in turns about its own left axis, on
+# banked ground. Height above the odometer, m, of the centre about which it tilts on its springs;
+# its sway there under lateral force, m per m/s^2. Lift of the axle in turns, m/rad: the third
+# point times the mean roll of the ground, (S12)
 BODY_TILT = constants_from('pitch_centre', 'lift_by_turning')
 LIFT = constants_from('lift_by_turning')
 # rad, left side up: mean roll of the ground of a leg. The mean attitude less this one determines
@@ -140,7 +140,7 @@ SPEED_OFFSET = CONSTANTS.index('speed_offset')
 # relative scale error
 VELOCITY = constants_from('velocity_delay', 'velocity_scale')
 VELOCITY_DELAY, VELOCITY_LAG2, VELOCITY_SCALE = range(VELOCITY.start, VELOCITY.stop)
-# heights by air pressure, (S19a): zero, m; weather, m/s; dynamic pressure, m per (m/s)^2; air
+# heights from air pressure, (S19a): zero, m; weather, m/s; dynamic pressure, m per (m/s)^2; air
 # temperature, relative
 PRESSURE = constants_from('pressure_offset', 'pressure_scale')
 M = len(CONSTANTS)      # number of constants c, (S2): (M,) in the shapes of arrays

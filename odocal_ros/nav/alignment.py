@@ -39,7 +39,7 @@ class Alignment:
     gyro_bias_sigma: Floats   # (3,) rad/s, in b
     gyro_noise: float         # rad/s/sqrt(Hz)
     gyro_bias_walk: float     # rad/s/sqrt(s)
-    # setting alignment.source; a heading by ``course`` includes the yaw mounting angle
+    # setting alignment.source; a heading from ``course`` includes the yaw mounting angle
     heading_source: str
     heading_shared: bool      # True: its error is the same in every leg
     standstill: tuple[float, float] | None = None    # begin and end, s; None: in motion
@@ -166,7 +166,7 @@ def earth_rate_deviation(level: LevelAttitude, latitude: float, grade: Grade) ->
 def make_alignment(level: LevelAttitude, yaw: float, yaw_sigma: float, source: str, shared: bool,
                    origin: Origin, grade: Grade, gyro_noise: float) -> Alignment:
     """
-    Return the Alignment by a level and a heading, with the gyro bias by a standstill.
+    Return the Alignment from a level and a heading, with the gyro bias from a standstill.
 
     yaw : of L's x axis in ENU at the level's position, rad.   yaw_sigma : of ``yaw``, rad.
     """

@@ -65,7 +65,7 @@ class CoarseSpeed:
 
     @property
     def truncation(self) -> float:
-        """Return the possible common error of all values by truncation: half a step."""
+        """Return the possible common error of all values from truncation: half a step."""
         return self.step / 2
 
     def mirrored(self, sign: Floats) -> 'CoarseSpeed':
@@ -86,7 +86,7 @@ class CoarseSpeed:
 
     def travel_variance(self, t: Floats) -> Floats:
         """
-        Return the variance of travel between n times, s, by rounding: (n - 1,) scale units^2.
+        Return the variance of travel between n times, s, from rounding: (n - 1,) scale units^2.
 
         A run of equal values has one error, uniform in its interval, that does not average out. It
         is replaced by white noise with the same variance over the run.
@@ -145,7 +145,7 @@ def _rate_limits(t: Floats, edge: Floats, step: float) -> Floats:
     Return an upper limit of the rate of change at each edge, (m,): the larger of both sides.
 
     It is at least the upper quartile of the drive: a small change between two cruises is as fast
-    as a large one, but has no other edge nearby. With a rate by its neighbours alone, the weight
+    as a large one, but has no other edge nearby. With a rate from its neighbours alone, the weight
     of an edge would depend on its error.
     """
     if len(t) < 2:
@@ -163,7 +163,7 @@ class HeldSpeed(CoarseSpeed):
 
     @property
     def truncation(self) -> float:
-        """Return the common error of all values by truncation: 0."""
+        """Return the common error of all values from truncation: 0."""
         return 0.0
 
     def mirrored(self, sign: Floats) -> 'HeldSpeed':

@@ -23,7 +23,7 @@ from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.nav.time_series import robust_sigma
 
 SHORT_SECTION = 2.0     # m, judgement: correlated fix errors change by less in that path
-# judgement: ratio of scales by short and long sections above which the path folds back; noise of
+# judgement: ratio of scales from short and long sections above which the path folds back; noise of
 # an eighth of a chord makes the short one 1 % longer
 MIN_FOLD_RATIO = 1.3
 

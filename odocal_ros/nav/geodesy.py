@@ -31,8 +31,8 @@ USUAL_LATITUDE_DEG = 45.0
 # m from the origin along an axis: there the vertical differs by 0.18 deg from the z axis.
 # Judgement: larger values are map coordinates (UTM), which are not in a tangent plane
 LARGEST_FRAME = 20_000.0
-# m, least significant motion of positions, by GNSS and in a local frame. Judgement: a receiver at
-# rest drifts by many metres, SLAM and motion capture by centimetres
+# m, least significant motion of positions, from GNSS and in a local frame. Judgement: a receiver
+# at rest drifts by many metres, SLAM and motion capture by centimetres
 MIN_GNSS_MOTION, MIN_LOCAL_MOTION = 20.0, 0.5
 
 

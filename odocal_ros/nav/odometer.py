@@ -71,7 +71,7 @@ def make_travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: b
 
     t : (n,) times, s, rising.   value : (n,) raw: int64 counters or float64.   form : meaning of
     the values.   reversed_counts : positive values mean backwards.   name : of the counter in
-    reasons. Rollovers are corrected, resets interpolated by the adjacent speed.
+    reasons. Rollovers are corrected, resets interpolated from the adjacent speed.
     """
     is_integer, sign = np.issubdtype(value.dtype, np.integer), -1.0 if reversed_counts else 1.0
     reasons: tuple[Reason, ...] = ()

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Errors of fixes by a filter or an odometer in the receiver, docs/method.md (S16) to (S16b).
+Errors of fixes due to a filter or an odometer in the receiver, docs/method.md (S16) to (S16b).
 
 A receiver has one of two filters with the time constant tau, described by one unknown, lag_square:
 
@@ -60,7 +60,7 @@ def _cubic_coefficients(t: Floats, position: Floats,
 def odometer_error(t: Floats, position: Floats, velocity: Floats, times: Floats,
                    scale_error: float, log_time: float) -> tuple[Floats, Floats, Floats]:
     """
-    Return the errors of fixes by an odometer in the receiver, (k, 3) m, (S16a).
+    Return the errors of fixes due to an odometer in the receiver, (k, 3) m, (S16a).
 
     Also their derivatives by ``scale_error`` and ``log_time``. The error is the scale error times
     the motion before each time, weighted by exp(-age / time): satellites correct the position

@@ -160,7 +160,7 @@ def yaw_from_quat(q: Floats) -> Floats:
 
 
 def quat_from_matrix(C: ArrayLike) -> Floats:
-    """Return the quaternion (w >= 0) of a rotation by the largest row of 4 q q^T: (..., 4)."""
+    """Return the quaternion (w >= 0) of a rotation from the largest row of 4 q q^T: (..., 4)."""
     C = np.asarray(C, dtype=float)
     xx, yy, zz = C[..., 0, 0], C[..., 1, 1], C[..., 2, 2]
     sx, sy, sz = (C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0],

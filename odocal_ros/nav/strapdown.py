@@ -164,7 +164,7 @@ def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs
 def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every: int = 1,
              bias: float | Floats = 0.0) -> tuple[Floats, Floats]:
     """
-    Return times (m,), s, and attitudes (m, 4), unit quaternions, propagated by gyro samples.
+    Return times (m,), s, and attitudes (m, 4), unit quaternions, propagated with gyro samples.
 
     t : (n,) s, rising.   w_b : (n, 3) turn rate of b relative to inertial space, rad/s.   q_nb0 :
     (4,) attitude at t[0], x y z w.   earth_rate_n : (3,) rad/s (n is fixed to the Earth).

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Time series: integrals, gaps in the times of rows, sigmas and lines by medians.
+Time series: integrals, gaps in the times of rows, sigmas and lines from medians.
 
 Integrals of long columns are computed in pieces, bitwise equal to integrals at once.
 """
@@ -82,7 +82,7 @@ def gaps_in_rhythm(t: Floats) -> Floats:
 
 
 def fit_robust_line(t: Floats, y: Floats) -> tuple[float, float]:
-    """Return value at the first time and slope of a line through points, (n,), by medians."""
+    """Return value at the first time and slope of a line through points, (n,), from medians."""
     if len(t) < 3:
         return float(np.median(y)), 0.0
     # median slope of pairs of points that are far apart (Theil and Sen), of at most 400 points

@@ -22,7 +22,7 @@ from odocal_ros.settings.nominal import G
 WALK_SPEED = 1.0     # m/s, judgement: below it, slopes are reduced towards zero
 WARM_TIME = 600.0    # s, physical: tyres warm within ten minutes of driving
 # definition: weights of the middle of a parabola through seven values (Savitzky and Golay, 1964).
-# Judgement: hills and banks last longer; the rest of a tilt is that of the body, by bumps
+# Judgement: hills and banks last longer; the rest of a tilt is that of the body, on bumps
 HILL_WEIGHTS = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0])
 RATE_WINDOW = 0.1    # s about a keyframe, judgement: the mean of it contains little vibration
 
@@ -90,7 +90,7 @@ class Axle:
 
     def _slope(self) -> Floats:
         """Return the slope of the road in each interval from the vertical velocity: (K,) rad."""
-        # not by the attitude, which contains the pitch mounting angle
+        # not from the attitude, which contains the pitch mounting angle
         speed, up = self._forward_speed(self.v_n), self.v_n[:, 2]
         double_speed = speed[1:] + speed[:-1]
         return (up[1:] + up[:-1]) * double_speed / np.maximum(double_speed**2, (2 * WALK_SPEED)**2)
@@ -105,7 +105,7 @@ class Axle:
         return self._tilts(self.state.C_bv[:, 1], self.left_acceleration)
 
     def _tilts(self, axis_b: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
-        """Return tilts of ground and body along an axis, by ``separate_tilts``: (N,) rad each."""
+        """Return tilts of ground and body along an axis (``separate_tilts``): (N,) rad each."""
         path = np.linalg.norm(self.v_n, axis=1) * np.gradient(self.state.t)
         return separate_tilts(self.state.C_nb[:, 2] @ axis_b, acceleration, path)
 
@@ -129,8 +129,8 @@ class Axle:
         return np.concatenate([force, jerk], axis=1)
 
     def traction_acceleration(self) -> Floats:
-        """Return the acceleration by traction (positive) and braking, (S11): (K,) m/s^2."""
-        # by speeds: in a turn with sideslip the centripetal acceleration has a forward component
+        """Return the acceleration due to traction (positive) and braking, (S11): (K,) m/s^2."""
+        # from speeds: in a turn with sideslip the centripetal acceleration has a forward component
         speed = self._forward_speed(self.v_n)
         by_slope: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + by_slope

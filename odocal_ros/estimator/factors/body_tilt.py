@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Displacement of the odometer by the tilt of the body, delta D of docs/method.md (S12).
+Displacement of the odometer due to the tilt of the body, delta D of docs/method.md (S12).
 
 The IMU measures the tilt of the body. On hills and banks the body tilts with the ground, about
-points at the height of the wheels on the ground. By bumps and by forces it tilts on its springs,
-about a centre above the ground. ``separate_tilts`` separates both.
+points at the height of the wheels on the ground. On bumps and under forces it tilts on its
+springs, about a centre above the ground. ``separate_tilts`` separates both.
 """
 
 import numpy as np
@@ -48,7 +48,7 @@ class BodyTilt:
 
 
 def _horizontal(state: State, axle: Axle, body_pitch: Floats) -> Floats:
-    """Return displacements by the height of the centre of the body, and by force: (K, 3, 2)."""
+    """Return displacements per height of the centre of the body, and per force: (K, 3, 2)."""
     left_n = level_left(state.C_nb @ state.forward)
     ahead_n = np.cross(left_n, [0.0, 0.0, 1.0])
     bank, roll = axle.rolls()

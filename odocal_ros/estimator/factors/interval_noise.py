@@ -12,7 +12,7 @@ the roots of their levels, the variances that the fit estimates.
 
 White noise at a time within the interval affects the rest of the interval. The integral over that
 time is a two-point Gauss rule: exact up to the third order, and 3 % off for the small terms of
-fourth order (position by gyro noise).
+fourth order (position from gyro noise).
 
 Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
 constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
@@ -45,8 +45,9 @@ MIN_TURN_SIDESLIP = 2e-4
 # m/sqrt(s), lower limit of vertical motion that the unknowns do not describe: springs, tyres,
 # road. Tuned: with a tenth of it, pitch was 3 sigmas off on drives in yards (docs/decisions/0005)
 MIN_VERTICAL_NOISE = 2e-3
-# m/rad, unmodelled lift of the axle per pitch of the body within an interval, as by kerbs shorter
-# than a wheelbase: initial value and lower limit, judgement; the value is estimated for each drive
+# m/rad, unmodelled lift of the axle per pitch of the body within an interval, as from kerbs
+# shorter than a wheelbase: initial value and lower limit, judgement; the value is estimated for
+# each drive
 PITCHING, MIN_PITCHING = 0.03, 1e-4
 MIN_ROAD_NOISE = 2e-4   # m/sqrt(s) along the path, physical: texture of the road under a tyre
 # m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
@@ -57,7 +58,7 @@ CORNER_ANGLE = np.pi / 2
 # lower limit is that of sideslip
 ALONG, SIDEWAYS = ('along', 'along_hard'), ('side', 'side_turn', 'up')
 # all of them, m^2/s, with the index of their axis: forward, left, up. _hard: while accelerating or
-# braking; _turn: in turns; pitching: m^2/rad^2, by the pitch of the body within the interval
+# braking; _turn: in turns; pitching: m^2/rad^2, from the pitch of the body within the interval
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
 INTERVAL = (*IMU, *ROAD)    # all levels of an interval
 # definition: Gauss and Legendre's nodes and weights on 0 to 1

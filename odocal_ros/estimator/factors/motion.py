@@ -39,7 +39,7 @@ INTERVAL_ATTRIBUTES = (
 
 
 def squared_bounce(inclination: Floats, slope: Floats) -> Floats:
-    """Return the squared inclination by a bounce of the body on its springs, (S11a): (K,)."""
+    """Return the squared inclination due to a bounce of the body on its springs, (S11a): (K,)."""
     # of the path to the body and to the horizontal: a bounce changes both, sway the former only, a
     # crest the latter only
     window = np.ones(BOUNCE_INTERVALS)
@@ -137,12 +137,12 @@ class Motion:
 
     @property
     def tilt_displacement(self) -> Floats:
-        """Return the displacement of the odometer by tilt, delta D of (S12): (K, 3) m."""
+        """Return the displacement of the odometer due to tilt, delta D of (S12): (K, 3) m."""
         return self.by_tilt @ self.state.constants[layout.BODY_TILT]
 
     @property
     def lean_angles(self) -> Floats:
-        """Return pitch and yaw of the forward axis by BODY_LEAN, (S12): (2, K) rad."""
+        """Return pitch and yaw of the forward axis from BODY_LEAN, (S12): (2, K) rad."""
         lean = self.lean_accelerations * self.state.constants[layout.BODY_LEAN]
         out: Floats = lean.reshape(-1, 2, 2).sum(axis=1).T
         return out
@@ -168,8 +168,9 @@ class Motion:
 
     def _inclination_ratio(self, straight: Floats) -> Floats:
         """Return the root of (S11a), (K,); set its derivative by a displacement along up_n."""
-        # the odometer counts the path along the ground, whatever the pitch of the body by sway or
-        # bumps; both projections on the body axis are shorter by the cosine of their inclination
+        # the odometer counts the path along the ground, whatever the pitch of the body on
+        # bumps or by sway; both projections on the body axis are shorter by the cosine of their
+        # inclination
         C_mean = (self.C + self.C_end) / 2
         self.up_n, forward_n = C_mean @ self.up, C_mean @ self.state.forward
 
@@ -195,7 +196,8 @@ class Motion:
 
     def _derivative_by_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
-        # by the estimated speed, whose changes the accelerometer measures better than the odometer
+        # from the estimated speed, whose changes the accelerometer measures better than the
+        # odometer
         speed = self.axle.wheel_speed / self.state.scale
         acceleration = np.gradient(speed, self.state.t)
         return np.stack([np.diff(speed), -np.diff(acceleration) / 2], -1)

@@ -47,7 +47,7 @@ MIN_FILTER_TIME = 0.2      # s, judgement: speeds closer in time differ by vibra
 
 
 def stamp_of(t: Floats, constants: Floats) -> Floats:
-    """Return the stamps of readings that were measured at times t, s, by delay and clock rate."""
+    """Return the stamps, late by delay and clock rate, of readings measured at times t, s."""
     out: Floats = t + constants[ODO_DELAY] + constants[ODO_CLOCK] * t
     return out
 
@@ -193,8 +193,8 @@ class SpeedSteps(PointRows):
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        # initial value and lower limit, factors on the variances by the step size; real steps are
-        # not more regular
+        # initial value and lower limit, factors on the variances from the step size; real steps
+        # are not more regular
         return {'steps': 1.0}, {'steps': 0.25}
 
     def whiten(self, x: Floats, rows: slice = slice(None)) -> Floats:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The factor of heights by air pressure, docs/method.md (S19a).
+The factor of heights from air pressure, docs/method.md (S19a).
 
 A pressure sensor measures height differences to a decimetre. Its zero, the weather, the dynamic
 pressure and the air temperature are constants of the leg.
@@ -42,7 +42,7 @@ class Pressure(ExternalSamples):
 
 
 class PressureRows(ExternalRows):
-    """Rows of the heights: by pressure minus predicted, m."""
+    """Rows of the heights: from pressure minus predicted, m."""
 
     name, source = 'pressure', 'air_pressure'
     level_columns = {'pressure': slice(0, 1)}

@@ -75,7 +75,7 @@ class FittedConstants:
     value: Floats           # (M,) ln K first, whole lever arms
     sigma: Floats           # (M,)
     sigma_ratio: Floats     # (M,) sigma of the fit over that of the prior
-    factor: float = 1.0     # by model errors, on the sigmas of angles before the comparison
+    factor: float = 1.0     # from model errors, on the sigmas of angles before the comparison
     changed_angles: Collection[str] = ()    # names of angles that change in the leg
 
 

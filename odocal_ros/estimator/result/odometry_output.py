@@ -169,7 +169,7 @@ class TwistNoise:
         return mean
 
     def _leg_variances(self, leg: dict[str, Any], v: float, w: float) -> Floats:
-        """Return ``variances`` by one leg; v, w : speed, m/s, turn rate, rad/s, both absolute."""
+        """Return ``variances`` from one leg; v, w : m/s, rad/s, speed and turn rate, absolute."""
         noise, odometer, T = leg['noise'], leg['odometer'], self.period
         K = self._estimate('scale_factor')[0]
         factor = self._estimate(AS_SENT)[0] or K
@@ -197,7 +197,7 @@ class TwistNoise:
                          self._turn_rate(leg, v, w, per_level, reading))
 
     def _scale_variance(self, leg: dict[str, Any], v: float) -> float:
-        """Return the variance of the speed by the scale: its sigma and its change with speed."""
+        """Return the variance of the speed from the scale: its sigma and its change with speed."""
         scale, sigma = self._estimate('scale_factor')
         by_speed = _mean_square(leg['scale_by_speed'])
         change = (v**2 - leg['odometer']['square_speed']) / (2 * FAST_SPEED)

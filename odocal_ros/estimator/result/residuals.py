@@ -191,7 +191,7 @@ class UnexplainedTravel(NamedTuple):
         return Reason(code, (
             f'the odometer counts {abs(self.metres):.1f} m ({100 * self.share:.2g} % of the path) '
             f'{relation} than the vehicle moves, mostly {condition}: {abs(self.sigmas):.1f} sigma '
-            f'of its noise (limit {REMARK_SIGMAS:g}). The scale is that of the other seconds'),
+            f'of its noise (limit {REMARK_SIGMAS:g}). The scale is from the other seconds'),
             f'Likely cause: {cause}. Compare the odometer with the fixes at these speeds. The '
             'uncertainty was increased.')
 

@@ -140,7 +140,7 @@ def _track_width(left: Wheel, right: Wheel, configured: float) -> tuple[Estimate
 
 
 def combine_wheels(legs: Sequence[MethodResult]) -> dict[str, Wheel]:
-    """Return the wheels of several legs: means, with sigmas by their scatter; {} without any."""
+    """Return the wheels of several legs: means, with sigmas from their scatter; {} without any."""
     by_name: dict[str, list[Mapping[str, Any]]] = {}
     for leg in legs:
         for name, wheel in leg.details.get('wheels', {}).items():

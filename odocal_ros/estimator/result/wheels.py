@@ -46,7 +46,8 @@ WHEEL_DELAY_SIGMA = 0.02    # s, judgement: of the stamps of a wheel relative to
 MAX_WHEEL_STEP = 0.3      # s, judgement: interpolation errors are then 1 to 2 cm
 MIN_WHEEL_INCREMENTS = 20  # judgement: with fewer, the sigma of a level is 30 % or more
 NUISANCE = range(2, 5)  # definition: indices of the delays and the drift among the unknowns
-# physical, relative error of x_i by sideslip and body motion: 20 mm of 2.7 m (docs/decisions/0022)
+# physical, relative error of x_i from sideslip and body motion: 20 mm of 2.7 m
+# (docs/decisions/0022)
 POSITION_ERROR = 8e-3
 WHEELBASE = 5.0         # m, physical: 1 sigma of x_i of a steered wheel, of a lorry
 
