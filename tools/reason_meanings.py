@@ -48,13 +48,12 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'only a part of a recording without marks (10 s or more are missing): the leg is limited '
         'to the time that all topics have. Travel across the gap is '
         'interpolated; its uncertainty is part of the sigma.',
-        Code.CLOCKS_DIFFER: 'The stamps of a topic differ by more than 0.5 s from the stamps of '
-        'IMU messages that arrived at the same time. Positions and travel would be combined at '
-        'wrong times.',
+        Code.CLOCKS_DIFFER: 'The stamps of a topic differ by more than 1 s (a heading: 0.5 s) '
+        'from those of IMU messages that arrived at the same time. Positions and travel would '
+        'be combined at wrong times. The node does not start a leg from 0.5 s on.',
         Code.CLOCK_SET: 'The stamps of a topic step by 10 ms or more against their arrival times, '
         'and stay so: its clock was set. The stamps on one side of the step were shifted by the '
-        'same amount; if the clock is that of the IMU, the marks too. Messages that queue do not '
-        'look like this: within 10 s they arrive as before.',
+        'same amount; if the clock is that of the IMU, the marks too.',
         Code.CLOCKS_DRIFT: 'The delay of one sensor changes during the leg by more than three '
         'sigmas and 10 ms: its clock is faster or slower than that of the IMU. Quartz clocks '
         'differ by up to 100 ppm, 0.1 s in 17 minutes. The smoother estimates the rate and '
@@ -64,8 +63,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'at this speed. The smoother estimates the delay and accounts for it; other software '
         'that combines these sensors does not. An offset of 1 to 90 s (clocks of two computers) '
         'is found by comparing the motion of IMU, odometer and fixes; the stamps are corrected '
-        'before the fit. Without an estimated delay, this reason names an odometer that would '
-        'look like a slipping wheel only because it is late or low-pass filtered.',
+        'before the fit. A difference of 0.5 to 1 s to IMU stamps that arrive at the same time is '
+        'of the clock or of the transport: the fit decides. Without an estimated delay, this '
+        'reason names an odometer that looks like a slipping wheel only because it is late or '
+        'low-pass filtered.',
         Code.ODOMETER_LATE: 'Odometer messages stopped for a moment and then arrived in a burst '
         'with the missing travel: they were delayed in transport, and their stamps, taken at '
         "arrival, are late. They were moved to the sender's rhythm, or to the times that match "

@@ -28,7 +28,7 @@ from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
-from odocal_ros.screening.clocks import without_clock_steps
+from odocal_ros.screening.clocks import with_delay_sigmas, without_clock_steps
 from odocal_ros.screening.imu_faults import gravity_turn_reasons, unit_change_reasons
 from odocal_ros.screening.imu_orientation import unit_and_axis_reasons, UNUSABLE
 from odocal_ros.screening.inputs import Inputs, locate_fixes
@@ -68,6 +68,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
         return planar_leg(leg, config, notes, progress)
     screened = screen_leg(leg, config, notes)
     leg, inputs = screened.leg, screened.inputs
+    config = with_delay_sigmas(config, inputs.clock_differences)
 
     def result_of(inputs: Inputs, reasons: Sequence[Reason]) -> LegResult:
         prepared, refusals = prepare(leg, inputs, config, reasons, alignment, holdout)

@@ -11,7 +11,7 @@ fixes with that of the odometer. Offsets up to MAX_CLOCK_OFFSET are delays, whic
 estimates.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -65,10 +65,10 @@ def stamp_offsets(config: Config) -> dict[str, float]:
     return {slot: offset(source.clock) - offset('imu') for slot, source in INPUTS.items()}
 
 
-def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
-    """Return reasons for clocks that differ from the IMU's at equal times of arrival."""
+def clock_differences(leg: Leg, config: Config) -> dict[str, float]:
+    """Return s ahead of IMU stamps that arrive at the same time, of topics beyond the limit."""
     offset = stamp_offsets(config)
-    reasons: list[Reason] = []
+    differences: dict[str, float] = {}
     imu = _stamped(leg.imu)
     for slot in TOPICS:
         samples = _stamped(leg.rows(slot))
@@ -77,15 +77,39 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
             continue
         lead_s = median(_lag_at(samples.received_ns, imu) - _lag(samples)) + offset[slot]
         if abs(lead_s) > CLOCK_DIFFERENCE_LIMIT:
-            group = INPUTS[slot].clock
-            hint = f'; if this is not transport delay, add {-lead_s:+z.3f} to {group}.time_offset'
-            reasons.append(Reason(
-                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {lead_s:+z.3f} s '
-                'from IMU stamps that arrive at the same time; the limit is '
-                f'{CLOCK_DIFFERENCE_LIMIT:g} s'
-                f'{hint if group and abs(lead_s) <= MAX_CLOCK_OFFSET else ""}',
-                clock_remedy(lead_s)))
+            differences[slot] = lead_s
+    return differences
+
+
+def clock_reasons(differences: Mapping[str, float]) -> list[Reason]:
+    """Return reasons for the clock differences of topics, s, as of ``clock_differences``."""
+    reasons = []
+    for slot, lead_s in differences.items():
+        group, text = INPUTS[slot].clock, (
+            f'{INPUTS[slot].label} stamps differ by {lead_s:+z.3f} s from IMU stamps that arrive '
+            f'at the same time; the limit is {CLOCK_DIFFERENCE_LIMIT:g} s')
+        reasons.append(Reason(
+            Code.DELAY_SEEN, f'{text}. {group}.time_sigma was increased to the difference',
+            f'If it is not transport delay, add {-lead_s:+z.3f} to {group}.time_offset.',
+        ) if _is_estimable(slot, lead_s) else Reason(
+            Code.CLOCKS_DIFFER, text, clock_remedy(lead_s)))
     return reasons
+
+
+def with_delay_sigmas(config: Config, differences: Mapping[str, float]) -> Config:
+    """Return settings by which delays as large as clock differences, s by topic, are likely."""
+    for slot, lead_s in differences.items():
+        if _is_estimable(slot, lead_s):
+            group = INPUTS[slot].clock
+            clock = getattr(config, group)
+            config = replace(config, **{
+                group: replace(clock, time_sigma=max(clock.time_sigma, abs(lead_s)))})
+    return config
+
+
+def _is_estimable(slot: str, lead_s: float) -> bool:
+    """Return True if a clock difference is in the range of the delays that methods estimate."""
+    return bool(INPUTS[slot].clock) and abs(lead_s) <= MAX_CLOCK_OFFSET
 
 
 def clock_remedy(lead_s: float) -> str:

@@ -65,6 +65,8 @@ class Inputs:
     is_local: bool = False             # True: fixes are positions in a local frame
     # corrected delays of clocks seconds from the IMU's, by group of settings: s, > 0 late
     clock_delays: Mapping[str, float] = field(default_factory=dict)
+    # stamps ahead of IMU stamps of the same arrival, by topic, beyond the limit: s
+    clock_differences: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def imu(self) -> ImuRows:

@@ -53,9 +53,11 @@ def screen(leg: Leg, config: Config,
     leg, local = without_north(leg, config)
     reasons: list[Reason] = [*levelled, *local, *other_frame_reasons(leg, config.imu)]
     reasons += _missing(leg, reasons)
+    clock_differences: dict[str, float] = {}
     if check_faults:
         leg, clock_steps = clocks.without_clock_steps(leg)
-        reasons += [*clock_steps, *clocks.clock_reasons(leg, config)]
+        clock_differences = clocks.clock_differences(leg, config)
+        reasons += [*clock_steps, *clocks.clock_reasons(clock_differences)]
     rows, wheels, row_reasons = _usable_topics(leg, config, check_faults)
     fixes, fix_reasons = _fix_fields(leg, config, rows)
     reasons += row_reasons + fix_reasons
@@ -67,7 +69,7 @@ def screen(leg: Leg, config: Config,
         f_b=_rotated(imu.f_i, config.imu.accel_scale, C_bi),
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
         scale_unit=leg.form.scale_unit, has_accelerometer=not levelled, is_local=bool(local),
-        **_travel_fields(leg, wheels), **fixes)
+        clock_differences=clock_differences, **_travel_fields(leg, wheels), **fixes)
     # the mean has the rows of the first wheel
     for slot, wheel in zip(leg.wheel_slots, (wheels.mean, *wheels.wheels[1:]), strict=False):
         reasons += topic_gap(slot, wheel.t)

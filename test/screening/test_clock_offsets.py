@@ -51,6 +51,28 @@ def test_clocks_that_are_seconds_apart_are_aligned(made, alone, slot, offset_s, 
         assert one.sigma == pytest.approx(other.sigma, rel=0.1)
 
 
+@pytest.mark.parametrize(('slot', 'offset_s'), [
+    ('odometer', 0.8), ('fix', 0.9), ('fix', -0.6), ('imu', 0.7), ('imu', -0.9)])
+@pytest.mark.parametrize('wrong', ['stamp_ns', 'received_ns'])
+def test_delays_below_a_second_are_estimated(made, alone, slot, offset_s, wrong):
+    rows, offset_ns = made.leg().rows(slot), round(offset_s * 1e9)
+    leg = made.leg().with_rows(**{slot: replace(rows, **{wrong: getattr(rows, wrong)
+                                                         + offset_ns})})
+    if wrong == 'stamp_ns' and slot == 'imu':
+        leg = replace(leg, start_ns=leg.start_ns + offset_ns, stop_ns=leg.stop_ns + offset_ns)
+    result = calibrate(leg, settings(made, method='smoother'))
+    assert result.verdict is alone.verdict
+    texts = [r.text for r in result.reasons if r.code is Code.DELAY_SEEN]
+    differ = {text.split(' stamps')[0] for text in texts if 'differ by' in text}
+    found = {text.split(' stamps')[0] for text in texts if 'accounted for' in text}
+    assert differ == LABELS[slot]
+    assert found == (LABELS[slot] if wrong == 'stamp_ns' else set())
+    for name in ('scale_factor', 'yaw_mounting_angle'):
+        one, other = (x.methods['smoother'].estimates[name] for x in (result, alone))
+        assert abs(one.value - other.value) < 0.5 * other.sigma
+        assert one.sigma == pytest.approx(other.sigma, rel=0.1)
+
+
 def test_clocks_that_agree_are_unchanged(made, alone):
     assert Code.DELAY_SEEN not in reason_texts(alone)
 

@@ -12,6 +12,7 @@ from screening_run import screen_with
 
 from odocal_ros.data.samples import join, take
 from odocal_ros.reasons import Code
+from odocal_ros.screening.clocks import MAX_CLOCK_OFFSET, with_delay_sigmas
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
@@ -139,22 +140,39 @@ def test_queued_messages_that_arrive_together_are_not_a_clock_offset(leg):
     held = leg.with_rows(**{slot: queued(leg.rows(slot)) for slot in ('imu', 'odometer', 'fix')})
     assert Code.CLOCKS_DIFFER not in screen_with(held)[1]
     late = with_columns(held, 'fix', stamp_ns=lambda a: a + 700_000_000)
-    assert 'fix stamps differ by +0.7' in screen_with(late)[1][Code.CLOCKS_DIFFER]
+    assert 'fix stamps differ by +0.7' in screen_with(late)[1][Code.DELAY_SEEN]
+
+
+@pytest.mark.parametrize(('slot', 'group'), [('odometer', 'odometer'), ('fix', 'gnss')])
+@pytest.mark.parametrize('late', [0.8, -0.8, 1.2, -1.2])
+def test_a_clock_offset_is_a_possible_delay_up_to_the_range_of_the_setting(
+        leg, slot, group, late):
+    moved = with_columns(leg, slot, stamp_ns=lambda a: a + round(late * 1e9))
+    inputs, codes = screen_with(moved)
+    is_delay = abs(late) < MAX_CLOCK_OFFSET
+    text = codes[Code.DELAY_SEEN if is_delay else Code.CLOCKS_DIFFER]
+    assert (Code.CLOCKS_DIFFER in codes) != is_delay
+    seen = float(text.split('differ by ')[1].split(' s')[0])
+    assert abs(seen - late) < 0.055       # the 0.05 s until fixes arrive looks the same
+    assert (f'{group}.time_sigma was increased' in text) == is_delay
+    config = with_delay_sigmas(Config(), inputs.clock_differences)
+    changed_sigmas = {name for name in ('odometer', 'gnss') if getattr(config, name).time_sigma
+                      != getattr(Config(), name).time_sigma}
+    assert changed_sigmas == ({group} if is_delay else set())
+    if is_delay:
+        assert getattr(config, group).time_sigma == pytest.approx(abs(seen), abs=1e-3)
+    if slot == 'fix':       # positions of marks have IMU stamps
+        assert not {Code.CLOCKS_DIFFER, Code.DELAY_SEEN} & set(screen_with(
+            moved, reference__points=[0.0, 0.0])[1])
 
 
 @pytest.mark.parametrize(('slot', 'setting'), [('odometer', 'odometer.time_offset'),
                                                ('fix', 'gnss.time_offset')])
 @pytest.mark.parametrize('late', [0.8, -0.8])
-def test_clock_offsets_reject_the_leg_until_an_offset_is_configured(leg, slot, setting, late):
+def test_a_configured_offset_corrects_the_stamps(leg, slot, setting, late):
     moved = with_columns(leg, slot, stamp_ns=lambda a: a + round(late * 1e9))
-    _, codes = screen_with(moved)
-    seen = float(codes[Code.CLOCKS_DIFFER].split('differ by ')[1].split(' s')[0])
-    assert abs(seen - late) < 0.055       # the 0.05 s until fixes arrive looks the same
-    assert f'to {setting}' in codes[Code.CLOCKS_DIFFER]
-    if slot == 'fix':       # positions of marks have IMU stamps
-        assert Code.CLOCKS_DIFFER not in screen_with(moved, reference__points=[0.0, 0.0])[1]
     inputs, codes = screen_with(moved, **{setting: -late})
-    assert Code.CLOCKS_DIFFER not in codes
+    assert not {Code.CLOCKS_DIFFER, Code.DELAY_SEEN} & set(codes)
     t = inputs.travel.t if slot == 'odometer' else inputs.t_fix
     np.testing.assert_allclose(t, seconds(leg, leg.rows(slot)), atol=1e-9)
 
