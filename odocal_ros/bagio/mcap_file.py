@@ -157,23 +157,14 @@ class McapFile(BagFile):
                 self._report_damage(
                     error if isinstance(error, Damaged) else Damaged('invalid record'))
 
-    def _messages_by_scan(self, chunk: mcap.Chunk, is_truncated: bool = False) -> list[mcap.Entry]:
-        """Return the messages of a chunk by time, from a sequential scan."""
-        messages = self._entries(bytes(chunk.records), is_truncated)
-        messages.sort(key=itemgetter(0))
-        if messages:
-            first_ns, last_ns = messages[0][0], messages[-1][0]
-            if not chunk.start_ns <= first_ns <= last_ns <= max(chunk.end_ns, chunk.start_ns):
-                raise Damaged(mcap.CHUNK_DAMAGED)
-        return messages
-
-    def _entries(self, records: bytes, is_truncated: bool) -> list[mcap.Entry]:
-        """Return the messages of a chunk; raise Damaged if any of its records is invalid."""
-        messages, offset, end = [], 0, len(records)
-        while (content := offset + mcap.RECORD.size) <= end:
+    def _messages_by_scan(self, chunk: mcap.Chunk,
+                          is_truncated: bool = False) -> list[mcap.Entry]:
+        """Return the messages of a chunk by time; raise Damaged if any record is invalid."""
+        records, messages, offset = bytes(chunk.records), [], 0
+        while (content := offset + mcap.RECORD.size) <= len(records):
             op, size = mcap.RECORD.unpack_from(records, offset)
             stop = content + size
-            if stop > end:
+            if stop > len(records):
                 break
             try:
                 if op == mcap.MESSAGE:
@@ -185,7 +176,10 @@ class McapFile(BagFile):
             except (Damaged, struct.error, UnicodeDecodeError):
                 raise Damaged(mcap.CHUNK_DAMAGED) from None
             offset = stop
-        if offset != end and not is_truncated:
+        messages.sort(key=itemgetter(0))
+        if (offset != len(records) and not is_truncated) or messages and not (
+                chunk.start_ns <= messages[0][0]
+                and messages[-1][0] <= max(chunk.end_ns, chunk.start_ns)):
             raise Damaged(mcap.CHUNK_DAMAGED)
         return messages
 

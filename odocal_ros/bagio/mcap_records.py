@@ -30,7 +30,7 @@ RECORD = struct.Struct('<BQ')               # before each record: opcode, size o
 MESSAGE_HEAD = struct.Struct('<HIQQ')       # channel, sequence number, bag time, publish time
 CHUNK_HEAD = struct.Struct('<QQQI')         # start, end, unpacked size, checksum
 INDEX_HEAD = struct.Struct('<QQQQ')         # of a chunk: start, end, offset, size of its record
-STATISTICS_HEAD = struct.Struct('<QHIIIIQQI')   # messages, ..., start, end, bytes of the counts
+STATISTICS_HEAD = struct.Struct('<QHIIIIQQI')   # counts, start, end, bytes of further counts
 TIMES = struct.Struct('<QQ')                # start and end of a chunk
 FOOTER_SIZE = RECORD.size + 20 + len(MAGIC)     # format: bytes of the footer record and the magic
 

@@ -114,6 +114,7 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel],
         start_ns, end_ns = min(start_ns, chunk.start_ns), max(end_ns, chunk.end_ns)
     end = _record(DATA_END, struct.pack('<I', 0))
     by_channel = b''.join(struct.pack('<HQ', *item) for item in counts.items())
+    # messages, schemas, channels, attachments, metadata, chunks
     statistics = mcap.STATISTICS_HEAD.pack(
         counts.total(), len(channels), len(channels), 0, 0, len(indexes), start_ns, end_ns,
         len(by_channel)) + by_channel
@@ -125,19 +126,14 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel],
 
 def _chunk_index(chunk: PackedChunk, offset: int) -> bytes:
     """Return the index record of a chunk at an offset of the file."""
-    _, _, size, _, compression, packed_size = _chunk_body(chunk.record)
+    head = mcap.RECORD.size
+    _, _, size, _ = mcap.CHUNK_HEAD.unpack_from(chunk.record, head)
+    compression, end = mcap.text_at(chunk.record, head + mcap.CHUNK_HEAD.size)
+    (packed_size,) = struct.unpack_from('<Q', chunk.record, end)
     return _record(mcap.CHUNK_INDEX, struct.pack(
         '<QQQQIHQQ', chunk.start_ns, chunk.end_ns, offset, len(chunk.record), 10, chunk.channel,
         offset + len(chunk.record), len(chunk.index)) + _text(compression)
         + struct.pack('<QQ', packed_size, size))
-
-
-def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
-    """Return start, end, unpacked size, CRC, compression and packed size of a chunk record."""
-    start_ns, end_ns, size, crc = mcap.CHUNK_HEAD.unpack_from(record, mcap.RECORD.size)
-    compression, offset = mcap.text_at(record, mcap.RECORD.size + mcap.CHUNK_HEAD.size)
-    (packed_size,) = struct.unpack_from('<Q', record, offset)
-    return start_ns, end_ns, size, crc, compression, packed_size
 
 
 def read_chunks(path: Path) -> Iterator[PackedChunk]:
@@ -154,7 +150,7 @@ def read_chunks(path: Path) -> Iterator[PackedChunk]:
                 chunk = record
             elif op == mcap.MESSAGE_INDEX:      # it follows its chunk
                 channel, index_bytes = struct.unpack_from('<HI', record, mcap.RECORD.size)
-                start_ns, end_ns, *_ = _chunk_body(chunk)
+                start_ns, end_ns = mcap.TIMES.unpack_from(chunk, mcap.RECORD.size)
                 yield PackedChunk(channel, start_ns, end_ns, index_bytes // 16, chunk, record)
 
 

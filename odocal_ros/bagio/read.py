@@ -105,7 +105,7 @@ class Bag:
             lost_s = 0.0 if end_ns is None else (end_ns - bag_file.end_ns) * 1e-9
             loss = ('without metadata.yaml the lost time is unknown' if end_ns is None else
                     f'{lost_s:.1f} s at the end are missing' if lost_s > MIN_LOSS_S else
-                    'the end is there, messages before it are missing')
+                    'messages before the end are missing')
             notes.append(Reason(Code.BAG_TRUNCATED, f'{damage}: {bag_file.count} messages in '
                                 f'{seconds:.1f} s were read; {loss}'))
         lost_s = (metadata.bag_span.end_ns - self.end_ns) * 1e-9 if metadata.bag_span else 0.0
@@ -201,11 +201,7 @@ def _merged(bag_files: list[BagFile], topics: Mapping[str, str]) -> Iterator[Bat
 
 @contextmanager
 def open_bag(path: Path | str) -> Iterator[Bag]:
-    """
-    Open a bag: a folder or a file, of any kind that ``sources`` supports. Use it in ``with``.
-
-    Raises BadBag: missing, unreadable, empty, or without usable content.
-    """
+    """Open a bag, a folder or a file, in a ``with``; raise BadBag without usable content."""
     with ExitStack() as stack:
         try:
             bag = _open_bag(Path(path), stack)
@@ -224,10 +220,10 @@ def _open_bag(path: Path, stack: ExitStack) -> Bag:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
     bag_files: list[BagFile] = []
     errors = []
-    total = sum(path.stat().st_size for path in source.files if is_file(path))
-    for path in source.files:
+    bag_bytes = sum(file.stat().st_size for file in source.files if is_file(file))
+    for file in source.files:
         try:
-            bag_file = _open_file(path, folder, total, types)
+            bag_file = _open_file(file, folder, bag_bytes, types)
         except BadBag as error:
             errors.append(error)
             continue
@@ -245,14 +241,15 @@ def _open_bag(path: Path, stack: ExitStack) -> Bag:
     return Bag(replace(source, notes=source.notes + bag_notes), bag_files, types)
 
 
-def _open_file(path: Path, folder: Path, total: int, types: Types) -> BagFile:
-    """Return an open file of a bag of ``total`` bytes, unpacked into ``folder`` if needed."""
-    file, kind = unpack(path, folder, total)
-    allowance = Allowance(path, total)
+def _open_file(path: Path, folder: Path, bag_bytes: int, types: Types) -> BagFile:
+    """Return an open file of a bag of ``bag_bytes``, unpacked into ``folder`` if needed."""
+    file, kind = unpack(path, folder, bag_bytes)
+    allowance = Allowance(path, bag_bytes)
     try:
-        bag_file: BagFile = (McapFile(file, allowance) if kind == '.mcap' else
-                         SqliteFile(file, allowance) if kind == '.db3' else
-                         Rosbag1File(file, allowance, types.cdr_from_ros1))
+        if kind == '.bag':
+            bag_file: BagFile = Rosbag1File(file, allowance, types.cdr_from_ros1)
+        else:
+            bag_file = (McapFile if kind == '.mcap' else SqliteFile)(file, allowance)
     except (Damaged, ValueError) as error:
         raise BadBag(f'{path}: cannot be read ({error})') from None
     bag_file.recorded_path = path

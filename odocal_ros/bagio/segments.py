@@ -61,11 +61,7 @@ class Segment:
 
 
 class SegmentedBag:
-    """
-    Writes a bag into a folder of its own, segment by segment.
-
-    Every method that writes may raise OSError; files written before stay valid.
-    """
+    """Writer of segments into a folder; files written before an OSError stay valid."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -124,10 +124,7 @@ def _number_key(path: Path) -> list[tuple[int, str]]:
 
 
 def _stem(path: Path) -> str:
-    name = path.name
-    for ending in ('.zstd', '.mcap', '.db3', '.bag'):
-        name = name.removesuffix(ending)
-    return name or path.name
+    return re.sub(r'(\.mcap|\.db3|\.bag)?(\.zstd)?$', '', path.name) or path.name
 
 
 def _read_metadata(path: Path) -> BagMetadata:
@@ -172,16 +169,16 @@ def _span(metadata: dict[str, Any]) -> Span | None:
     return Span(end_ns, count)
 
 
-def unpack(path: Path, folder: Path, total: int) -> tuple[Path, str]:
+def unpack(path: Path, folder: Path, bag_bytes: int) -> tuple[Path, str]:
     """
     Return a plain file with a bag's content, and its kind ('.mcap', '.db3', '.bag').
 
     Compressed files, and databases with changes in a separate -wal file, are unpacked into
-    ``folder``; the user's files are not changed. ``total`` is the size of the whole bag, bytes.
+    ``folder``; the user's files are not changed. ``bag_bytes`` is the size of the whole bag.
     """
     kind = kind_of(path)
     if kind == '.zstd':
-        path = _decompressed(path, folder, limits.Allowance(path, total))
+        path = _decompressed(path, folder, limits.Allowance(path, bag_bytes))
         kind = kind_of(path)
     wal = path.with_name(path.name + '-wal')
     if kind == '.db3' and limits.is_file(wal) and wal.stat().st_size:

@@ -71,7 +71,8 @@ def write_bag(path: Path, topics: Sequence[encode.Topic], storage: str = 'mcap',
             shutil.rmtree(path)
         bag.replace(path)
     except OSError as error:
-        raise BadUsage(f'{path}: writing failed ({error.strerror}); nothing was kept') from None
+        raise BadUsage(f'{path}: writing failed ({error.strerror}); the incomplete bag was '
+                       'deleted; choose another --out') from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return path

@@ -52,16 +52,16 @@ class Allowance:
     """
     Limit of the bytes that a file of a bag may decompress to in one pass, and count of them.
 
-    path : of the compressed file.   total : bytes of all files of its bag.
+    path : of the compressed file.   bag_bytes : of all files of its bag.
     """
 
-    def __init__(self, path: Path, total: int) -> None:
+    def __init__(self, path: Path, bag_bytes: int) -> None:
         packed = path.stat().st_size
         self._what = f'{path}: unpacked, it'
         always_allowed = 2**26    # bytes of a bag, distributed over its files
         # further bytes for each byte of the file; sensor messages compress to a tenth
         ratio = 40
-        self.limit = int(always_allowed * packed / max(total, packed, 1) + ratio * packed)
+        self.limit = int(always_allowed * packed / max(bag_bytes, packed, 1) + ratio * packed)
         self._used = 0
 
     def restart(self) -> None:
@@ -148,11 +148,7 @@ def is_file(path: Path) -> bool:
 
 
 def read_text(path: Path) -> str:
-    """
-    Return the text of a YAML file; a pipe is allowed, if the user names one.
-
-    Raises LimitReached, OSError, UnicodeDecodeError.
-    """
+    """Return the text of a YAML file; a pipe is allowed. May raise UnicodeDecodeError."""
     max_bytes = 2**19    # of a YAML file
     return read_bytes(path, max_bytes).decode()
 

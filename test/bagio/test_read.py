@@ -52,7 +52,7 @@ def test_bags_of_rosbag2_are_read(data_dir, name, files, messages, topics):
 
 
 @pytest.mark.parametrize(('name', 'says'), [
-    ('empty_sqlite3_with_wal', 'the bag is empty, 0 messages on 2 topics'),
+    ('empty_sqlite3_with_wal', 'with_wal: the bag is empty, 0 messages on 2 topics'),
     ('unknown_serialization_sqlite3', "'wrong_format', only cdr"),
     ('README.md', 'a text file, which is not a bag'), ('nothing_here', 'no such file or folder')])
 def test_bags_that_cannot_be_read_are_refused_with_the_reason(data_dir, name, says):

@@ -16,6 +16,7 @@ from rosbags import rosbag2
 
 from odocal_ros.bagio import mcap_write, segments
 from odocal_ros.bagio.bag_file import Channel
+from odocal_ros.bagio.mcap_records import CHUNK_HEAD, text_at
 from odocal_ros.bagio.mcap_write import pack, read_chunks, write_file
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.segments import joined_name, JOURNAL, part_name, SegmentedBag
@@ -110,8 +111,9 @@ def test_the_index_of_a_chunk_points_at_its_messages(monkeypatch, zstd):
         monkeypatch.setattr(mcap_write, '_zstd', lambda: None)
     times, raws = [T0 + 5, T0 + 3, T0 + 9], [b'a' * 10, b'b', b'c' * 300]
     chunk = pack(7, times, raws, sequence=40)
-    start_ns, end_ns, size, crc, form, packed = mcap_write._chunk_body(chunk.record)
-    records = chunk.record[-packed:]
+    start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(chunk.record, 9)
+    form, at = text_at(chunk.record, 9 + CHUNK_HEAD.size)
+    records = chunk.record[at + 8:]
     records = mcap_write.zstd_module().decompress(records) if zstd else records
     assert (start_ns, end_ns, size, crc, form) == (
         T0 + 3, T0 + 9, len(records), zlib.crc32(records), 'zstd' if zstd else '')
