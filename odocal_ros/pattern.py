@@ -1,16 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Patterns inside a rectangle: routes of straights and quarter circles, how to follow one."""
+"""Patterns of straights and quarter circles in a rectangle, and the control that follows one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 import math
 
 from odocal_ros.errors import BadConfig
 from odocal_ros.settings.node_configs import PatternConfig
 
-HALF_TURN = 3.0       # rad. Judgement: from here the robot may turn to either side
+MIN_HALF_TURN = 3.0       # rad. Judgement: from here the robot may turn to either side
 MIN_SIDE = 0.5      # m of the pattern. Judgement: below, a robot of 0.3 m turns more than drives
 Point = tuple[float, float]
 Rectangle = tuple[float, float, float, float]      # x and y, least and largest
@@ -18,11 +19,11 @@ Rectangle = tuple[float, float, float, float]      # x and y, least and largest
 # 0.1 and 0.2 s late, robots leave the pattern by 0.9 and 2.5 cm with any value from 0.2 to 0.8
 CORRECTION_LENGTH = 0.4
 MAX_HEADING_ERROR = 0.2             # rad. Judgement: beyond it the robot turns on the spot
-ALIGNED = 0.02                      # rad. Judgement: heading error at which this turn ends
+ALIGNED_ERROR = 0.02                      # rad. Judgement: heading error at which this turn ends
 TURN_GAIN, TURN_RESERVE = 1.5, 1.5  # 1/s, turn rate per error; limit over turn rate. Judgement
-SLOWEST, SLOWEST_TURN = 0.03, 0.1   # m/s, rad/s. Judgement: slower, many wheels stick
-MOVED, MOVED_TURN = 0.01, 0.02      # m, rad. Judgement: at the slowest within a second
-POSE_LOST_S = 0.5                   # judgement: without a pose
+MIN_SPEED, MIN_TURN_RATE = 0.03, 0.1   # m/s, rad/s. Judgement: slower, many wheels stick
+MIN_MOTION, MIN_ROTATION = 0.01, 0.02      # m, rad. Judgement: at the slowest within a second
+MAX_POSE_AGE = 0.5                  # s, judgement: the robot stops without a newer pose
 Pose = tuple[float, float, float]   # x, y, m, and heading, rad
 
 
@@ -63,18 +64,16 @@ def route_of(config: PatternConfig, start: Point) -> tuple[Piece, ...]:
     """
     Return the straight to a pattern, and the pattern.
 
-    start : position of the robot inside the rectangle, m.
-
-    Raises BadConfig: the rectangle is too small.
+    start : position of the robot, m. Raises BadConfig: the rectangle is too small.
     """
     left, low, right, high = rectangle_of(config)
-    inner = left + config.margin, low + config.margin, right - config.margin, high - config.margin
-    side = min(inner[2] - inner[0], inner[3] - inner[1])
+    margin = config.margin
+    side = min(right - left, high - low) - 2 * margin
     if side < MIN_SIDE:
         raise BadConfig(f'rectangle: the pattern has {max(side, 0):.2f} m, required: '
                         f'{MIN_SIDE:g} m; enlarge the rectangle or lower margin')
     pattern_pieces = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight}[
-        config.pattern](inner)
+        config.pattern]((left + margin, low + margin, right - margin, high - margin))
     first = (pattern_pieces[0].x, pattern_pieces[0].y)
     return tuple(_alternating([*_lines([start, first]), *(pattern_pieces * config.rounds)]))
 
@@ -82,27 +81,27 @@ def route_of(config: PatternConfig, start: Point) -> tuple[Piece, ...]:
 def _alternating(pieces: list[Piece]) -> list[Piece]:
     """Return pieces with half turns to the left and right by turns, as the track width needs."""
     alternating, side = pieces[:1], 1
-    for before, piece in zip(pieces, pieces[1:], strict=False):
+    for before, piece in pairwise(pieces):
         alternating.append(replace(piece, side=side))
         if abs(_angle(piece.heading - before.heading - before.curvature * before.length)
-               ) > HALF_TURN:
+               ) > MIN_HALF_TURN:
             side = -side
     return alternating
 
 
 def _lines(points: Sequence[Point]) -> list[Piece]:
     """Return the straights from point to point."""
-    return [Piece(*a, math.atan2(b[1] - a[1], b[0] - a[0]), math.dist(a, b))
-            for a, b in zip(points, points[1:], strict=False) if a != b]
+    return [Piece(x, y, math.atan2(next_y - y, next_x - x), math.dist((x, y), (next_x, next_y)))
+            for (x, y), (next_x, next_y) in pairwise(points) if (x, y) != (next_x, next_y)]
 
 
 def _straight(inner: Rectangle) -> list[Piece]:
     """Return a line back and forth in the middle, along the longer side."""
     x, y, right, high = inner
     middle_x, middle_y = (x + right) / 2, (y + high) / 2
-    a, b = ((x, middle_y), (right, middle_y)) if right - x >= high - y else (
+    begin, end = ((x, middle_y), (right, middle_y)) if right - x >= high - y else (
         (middle_x, y), (middle_x, high))
-    return _lines([a, b, a])
+    return _lines([begin, end, begin])
 
 
 def _square(inner: Rectangle) -> list[Piece]:
@@ -122,12 +121,12 @@ def _figure_eight(inner: Rectangle) -> list[Piece]:
     pieces = []
     for side in (1, -1):
         for quarter in range(4):
-            turned = heading + side * quarter * math.pi / 2
+            piece_yaw = heading + side * quarter * math.pi / 2
             # from the middle to the centre of the circle, and from there to the start
             pieces.append(Piece(
-                centre[0] + side * radius * (math.sin(turned) - math.sin(heading)),
-                centre[1] + side * radius * (math.cos(heading) - math.cos(turned)),
-                turned, radius * math.pi / 2, side / radius, stops=side < 0 and quarter == 3))
+                centre[0] + side * radius * (math.sin(piece_yaw) - math.sin(heading)),
+                centre[1] + side * radius * (math.cos(heading) - math.cos(piece_yaw)),
+                piece_yaw, radius * math.pi / 2, side / radius, stops=side < 0 and quarter == 3))
     return pieces
 
 
@@ -149,16 +148,16 @@ def command(route: Sequence[Piece], progress: Progress, pose: Pose, t: float,
     progress = replace(progress, t=t)
     if progress.piece == len(route) or t < progress.rest_until:
         return 0.0, 0.0, replace(progress, speed=0.0)
-    piece = route[progress.piece]
-    along, left = piece.along_and_left(*pose[:2])
-    heading_error = _angle(pose[2] - piece.heading - piece.curvature * along)
-    if abs(heading_error) > HALF_TURN:
+    piece, (x, y, heading) = route[progress.piece], pose
+    along, left = piece.along_and_left(x, y)
+    heading_error = _angle(heading - piece.heading - piece.curvature * along)
+    if abs(heading_error) > MIN_HALF_TURN:
         heading_error = math.copysign(heading_error, -piece.side)
-    if progress.turning and abs(heading_error) > ALIGNED:
-        rate = max(min(TURN_GAIN * abs(heading_error), config.turn_rate), SLOWEST_TURN)
+    if progress.turning and abs(heading_error) > ALIGNED_ERROR:
+        rate = max(min(TURN_GAIN * abs(heading_error), config.turn_rate), MIN_TURN_RATE)
         return 0.0, -math.copysign(rate, heading_error), replace(progress, speed=0.0)
-    remaining = piece.length - along      # m
-    if remaining <= 0:
+    length_left = piece.length - along      # m
+    if length_left <= 0:
         progress = replace(progress, piece=progress.piece + 1, turning=piece.stops)
         if piece.stops:
             progress = replace(progress, speed=0.0, rest_until=t + config.rest)
@@ -168,8 +167,8 @@ def command(route: Sequence[Piece], progress: Progress, pose: Pose, t: float,
     limit = min(config.speed, config.turn_rate / abs(piece.curvature or 1e-9) / TURN_RESERVE,
                 progress.speed + config.acceleration * step_s)
     if piece.stops:
-        limit = min(limit, math.sqrt(2 * config.acceleration * remaining))
-    speed = min(max(limit, SLOWEST), config.speed)
+        limit = min(limit, math.sqrt(2 * config.acceleration * length_left))
+    speed = min(max(limit, MIN_SPEED), config.speed)
     # critically damped: with d = CORRECTION_LENGTH and derivatives by path length,
     # left'' = -left / d^2 - 2 left' / d, where left' is the heading error
     curvature = (piece.curvature - left / CORRECTION_LENGTH**2
@@ -180,8 +179,8 @@ def command(route: Sequence[Piece], progress: Progress, pose: Pose, t: float,
 
 def has_moved(before: Pose, after: Pose) -> bool:
     """Return True if a robot surely moves between two poses."""
-    return (math.dist(before[:2], after[:2]) > MOVED
-            or abs(_angle(after[2] - before[2])) > MOVED_TURN)
+    return (math.dist(before[:2], after[:2]) > MIN_MOTION
+            or abs(_angle(after[2] - before[2])) > MIN_ROTATION)
 
 
 def stop_cause(pose: Pose | None, age_s: float, rectangle: Rectangle, bumped: bool,
@@ -189,12 +188,12 @@ def stop_cause(pose: Pose | None, age_s: float, rectangle: Rectangle, bumped: bo
     """Return the cause to stop at once, '' without one; driven_s : time since the start."""
     if bumped:
         return 'the bumper is pressed'
-    if pose is None or not age_s <= POSE_LOST_S:
-        return f'no pose for {POSE_LOST_S:g} s'
-    x, y, _ = pose
-    if not (rectangle[0] <= x <= rectangle[2] and rectangle[1] <= y <= rectangle[3]):
+    if pose is None or not age_s <= MAX_POSE_AGE:
+        return f'no pose for {MAX_POSE_AGE:g} s'
+    (x, y, heading), (left, low, right, high) = pose, rectangle
+    if not (left <= x <= right and low <= y <= high):
         return f'the robot is outside the rectangle, at x {x:.2f} m, y {y:.2f} m'
-    if not math.isfinite(pose[2]):
+    if not math.isfinite(heading):
         return 'the pose has no heading'
     return f'timeout of {timeout_s:g} s' if driven_s > timeout_s else ''
 

@@ -5,7 +5,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, unique
 from typing import Any
 
 
@@ -26,6 +26,7 @@ SEVERITY = tuple(Verdict)      # the most severe last
 NOTE, CAUTION, REJECT = Verdict.ACCEPTED, Verdict.CAUTION, Verdict.REJECTED
 
 
+@unique
 class Code(Enum):
     """A reason code: its severity, and its remedy if the reason has no special one."""
 
@@ -251,12 +252,6 @@ class Code(Enum):
     def __init__(self, severity: Verdict, remedy: str) -> None:
         self.severity = severity
         self.remedy = remedy
-
-    def __new__(cls, *args: object) -> 'Code':
-        """Give each code a value of its own, so that equal pairs do not become aliases."""
-        member = object.__new__(cls)
-        member._value_ = len(cls.__members__)
-        return member
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ FROZEN_TIME = 0.1         # s; judgement: rows that are equal for longer are fro
 TURN_CHANGE = 10.0        # rad/s^2; physical: limit for a vehicle, except over a stone
 IMPLAUSIBLE_TIME = 1.0    # s; judgement: a longer turn after a step is real
 ISOLATED_CHANGE = 2.5     # rad/s^2; judgement: least isolated step; turns start more slowly
-OUTLIER_LIMITS = (glitches.SINGLE_TURN,) * 3 + (glitches.SINGLE_FORCE,) * 3
+OUTLIER_LIMITS = (glitches.SINGLE_RATE,) * 3 + (glitches.SINGLE_FORCE,) * 3
 OUTLIER_ROWS = glitches.NEIGHBOUR_ROWS + 4      # definition: rows that ``is_outlier`` uses
 
 
@@ -88,7 +88,7 @@ class SpikeScreen:
             step, isolated = _step(last, row), self._isolated_axes(rows[k:k + 2])
             spike_rows = None      # number of rows after this one until the values are back
             if any(self._exceeds_usual(step)) and not self._step_is_over(row):
-                end = bisect_right(rows, last.t + glitches.GLITCH_TIME, key=row_time)
+                end = bisect_right(rows, last.t + glitches.SPIKE_TIME, key=row_time)
                 spike_rows = self._rows_until_return(last, rows[k + 1:end], step)
                 if spike_rows is None and end == len(rows):
                     break              # wait for later rows
@@ -109,13 +109,13 @@ class SpikeScreen:
         """Return a mask of gyro axes with an isolated step; a turn starts over several rows."""
         kept = self._kept
         if self._dropped or len(kept) <= glitches.NEIGHBOUR_ROWS or (
-                _largest(kept[-1].w_b, rows[0].w_b) <= glitches.SINGLE_TURN):
+                _largest(kept[-1].w_b, rows[0].w_b) <= glitches.SINGLE_RATE):
             return ()
         steps = [[abs(b - a) for a, b in zip(before.w_b, after.w_b, strict=True)]
                  for before, after in pairwise((*kept, *rows))]
         current_step = steps.pop(glitches.NEIGHBOUR_ROWS)
-        limit = max(glitches.SINGLE_TURN, ISOLATED_CHANGE * (rows[0].t - kept[-1].t))
-        return tuple(size > max(limit, glitches.SINGLE_TIMES * max(other_steps))
+        limit = max(glitches.SINGLE_RATE, ISOLATED_CHANGE * (rows[0].t - kept[-1].t))
+        return tuple(size > max(limit, glitches.SINGLE_RATIO * max(other_steps))
                      for size, *other_steps in zip(current_step, *steps, strict=True))
 
     def _step_is_over(self, row: ImuRow) -> bool:
@@ -130,7 +130,7 @@ class SpikeScreen:
             self._step_size = ZERO
         elif self._step_size is ZERO:
             limit = max(TURN_CHANGE * (row.t - last.t),
-                        glitches.USUAL_STEPS * glitches.TURN_STEP * self._mean_steps[0])
+                        glitches.SPIKE_RATIO * glitches.SPIKE_RATE * self._mean_steps[0])
             if any(isolated) or _largest(last.w_b, row.w_b) > limit:
                 steps = (abs(b - a) for a, b in zip(last.w_b, row.w_b, strict=True))
                 x, y, z = (size if is_isolated or size > limit else 0.0
@@ -141,13 +141,13 @@ class SpikeScreen:
 
     def _exceeds_usual(self, step: Step) -> tuple[bool, ...]:
         """Return True for gyro and force if the step is implausible for a vehicle."""
-        return tuple(size > max(1.0, glitches.USUAL_STEPS * usual)
+        return tuple(size > max(1.0, glitches.SPIKE_RATIO * usual)
                      for size, usual in zip(step, self._mean_steps, strict=True))
 
     def _update_usual_step(self, step: Step) -> None:
         """Update the mean step; a single spike has little effect."""
         turn, force = (
-            usual + (min(size, 4 * usual + 1 / glitches.USUAL_STEPS) - usual) / MEAN_STEP_ROWS
+            usual + (min(size, 4 * usual + 1 / glitches.SPIKE_RATIO) - usual) / MEAN_STEP_ROWS
             for size, usual in zip(step, self._mean_steps, strict=True))
         self._mean_steps = turn, force
 
@@ -168,9 +168,9 @@ def _largest(a: Vector, b: Vector) -> float:
 
 
 def _step(last: ImuRow, row: ImuRow) -> Step:
-    """Return the steps of gyro and force over TURN_STEP and FORCE_STEP; 0 for NO_FORCE."""
-    force = _largest(last.f_b, row.f_b) / glitches.FORCE_STEP
-    return _largest(last.w_b, row.w_b) / glitches.TURN_STEP, 0.0 if math.isnan(force) else force
+    """Return the steps of gyro and force over SPIKE_RATE and SPIKE_FORCE; 0 for NO_FORCE."""
+    force = _largest(last.f_b, row.f_b) / glitches.SPIKE_FORCE
+    return _largest(last.w_b, row.w_b) / glitches.SPIKE_RATE, 0.0 if math.isnan(force) else force
 
 
 def is_outlier(rows: Sequence[ImuRow]) -> bool:
@@ -183,7 +183,7 @@ def is_outlier(rows: Sequence[ImuRow]) -> bool:
         return False
     before, row, after = rows[-3:]
     min_share = 1 - glitches.EQUAL_NEIGHBOURS / 2    # of the deviation: step to an outlier
-    if not (_largest(before.w_b, row.w_b) > min_share * glitches.SINGLE_TURN
+    if not (_largest(before.w_b, row.w_b) > min_share * glitches.SINGLE_RATE
             or _largest(before.f_b, row.f_b) > min_share * glitches.SINGLE_FORCE):
         return False
     values = [(*imu_row.w_b, *imu_row.f_b) for imu_row in rows]      # six columns
@@ -191,7 +191,7 @@ def is_outlier(rows: Sequence[ImuRow]) -> bool:
         deviation = abs(b - (a + c) / 2)
         if deviation > limit and abs(c - a) < glitches.EQUAL_NEIGHBOURS * deviation:
             x = [row_values[k] for row_values in values[:-2]]
-            if all(deviation > glitches.SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
+            if all(deviation > glitches.SINGLE_RATIO * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
                    for i in range(1, len(x) - 1)):
                 return True
     return False

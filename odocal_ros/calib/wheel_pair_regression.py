@@ -85,7 +85,7 @@ def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
     keep &= np.abs(design[:, 0]) + np.abs(y) > 2 * pair.quantum
     if keep.sum() < MIN_FIT_CELLS:
         return None
-    width_sigma = TRACK_WIDTH.first_sigma / metres_per_unit
+    width_sigma = TRACK_WIDTH.comparison_sigma / metres_per_unit
     prior = np.array([np.inf, width_sigma, np.inf, PAIR_DELAY_SIGMA,
                       PAIR_DELAY_SIGMA * PAIR_DELAY_WIDTH / metres_per_unit, LOAD_SIGMA])
     prior = np.append(prior, np.full(regressors.shape[1] - len(prior), np.inf))
@@ -103,7 +103,7 @@ def side_reasons(pair: WheelPair, width: float, sigma: float,
     width, sigma : track width by the regression, m; negative if the sides are swapped.
     track_width : m, as configured; 0 unknown.
     """
-    if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least, track_width / 2):
+    if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.minimum, track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
                        f'would be {width:.3f} ± {sigma:.2g} m. Likely cause: one counter is '
                        'sent twice', SENT_TWICE_REMEDY),)

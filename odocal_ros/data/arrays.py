@@ -128,7 +128,7 @@ def map_windows(function: Callable[..., Array], *arrays: Array, following: int =
 
 def thinned(x: Array, min_rows: int) -> Array:
     """Return evenly spaced rows of x, at least ``min_rows``, or all if there are fewer."""
-    step = max(1, len(x) // min_rows)
+    step = max(1, len(x) // min_rows)      # rows whose number is a multiple of it
     parts = [x[rows][-rows.start % step::step].copy() for rows in chunks(len(x))]
     return np.concatenate(parts or [x])
 
@@ -151,15 +151,12 @@ def lengths(x: Floats) -> Floats:
 
 def runs(flags: Bools) -> Ints:
     """Return begin and end of the runs of True: (k, 2), ends exclusive."""
+    # changes of the flags are begin and end by turns
     return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
 
 
 def median(x: Floats) -> float:
-    """
-    Return the median of x, (n,), like numpy but four times as fast for many rows.
-
-    Only the values near the median of a sample of x are sorted.
-    """
+    """Return the median of x, (n,), as np.median; of many rows only the middle ones are sorted."""
     if len(x) < CHUNK_ROWS:
         return float(np.median(x))
     sample = np.sort(x[::64])

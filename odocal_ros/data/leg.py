@@ -123,9 +123,9 @@ class LegRecorder:
         """
         days = (stop_ns - start_ns) / 86400e9
         if days > MAX_DAYS:
-            raise BadData(f'the leg lasts {days:.0f} days according to its stamps: a clock was '
-                          'set during recording, or the stamps are damaged; mark a section with '
-                          '--leg A:B')
+            raise BadData(f'the leg lasts {days:.0f} days according to its stamps (limit '
+                          f'{MAX_DAYS}): a clock was set during recording, or the stamps are '
+                          'damaged; mark a section with --leg A:B')
         first_ns = start_ns - round(preroll * 1e9)
         rows = {slot: _cut(self.rows(slot), first_ns, stop_ns) for slot in SLOTS}
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=self.form,

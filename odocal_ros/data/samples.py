@@ -180,11 +180,7 @@ def readings_of(samples: Samples) -> list[Reading]:
 
 
 def from_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:
-    """
-    Return samples of valid columns, which become read-only, without checks and copies.
-
-    No other code may write to the arrays.
-    """
+    """Return samples of valid columns, without copies: no other code may write to the arrays."""
     samples = object.__new__(kind)
     for array in columns:
         array.setflags(write=False)

@@ -169,7 +169,7 @@ class Quantity:
         """Return the limit of the sigma, relative to the value or rad."""
         if self.estimates[0] == 'track_width':
             # it has no setting verdict.*, only the limit of the estimator
-            return TRACK_WIDTH.determined_share
+            return TRACK_WIDTH.max_sigma_share
         return config.verdict.max_scale_sigma if self.is_relative else config.verdict.max_yaw_sigma
 
 

@@ -106,12 +106,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def locked(folder: Path, wait: bool = True) -> Iterator[bool]:
-    """
-    Lock a folder against other callers; yields True if it is locked.
-
-    No lock file is created, and the lock ends with the process. Yields True also without support
-    for locks, as on some network disks.
-    """
+    """Lock a folder until the end of the block or process; yield False if another one has it."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except PermissionError:
@@ -124,7 +119,7 @@ def locked(folder: Path, wait: bool = True) -> Iterator[bool]:
             yield False
             return
         except OSError:
-            pass
+            pass      # no support for locks, as on some network disks
         yield True
     finally:
         os.close(handle)
@@ -150,8 +145,8 @@ class ResultFolder:
     """
     A folder for the files of a result.
 
-    main : name of the file that marks a complete result.   result_names : names of all possible
-    files of a result.
+    place : path of the folder.   main : name of the file that marks a complete result.
+    result_names : names of all possible files of a result.
     """
 
     def __init__(self, place: Path, main: str, result_names: frozenset[str]) -> None:

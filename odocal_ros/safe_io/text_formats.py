@@ -115,11 +115,7 @@ def yaml_number(value: float | None) -> str:
 
 
 def date_text(iso: str) -> str:
-    """
-    Return a date and time, UTC, as text that YAML reads as text even without quotes.
-
-    ros2 param load reads each value twice, and cannot set a date.
-    """
+    """Return a date and time, UTC, as text for YAML: ros2 param load cannot set a date."""
     return f'{datetime.fromisoformat(iso).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
 
 

@@ -25,7 +25,7 @@ TESTED_GROUPS = 40        # judgement: groups of them, whose sums give the signi
 # definition: a row and the two before and after it, whose cubic predicts its values
 OFFSETS, MIDDLE, NEIGHBOURS = np.arange(-2, 3), 2, (0, 1, 3, 4)
 MIN_STEP = 1e-9         # s, judgement: minimum difference between rows
-SMOOTHER_SIGMAS = 4.0     # statistical: significance of smoother rows: by chance once in 30,000
+REGULAR_SIGMAS = 4.0     # statistical: significance of smoother rows: by chance once in 30,000
 
 
 def even_imu_times(t: Floats, w: Floats, f: Floats) -> Floats:
@@ -41,7 +41,7 @@ def even_imu_times(t: Floats, w: Floats, f: Floats) -> Floats:
     stamps, even = t[tested], even_times.times_of(t, tested)
     has_jitter = np.median(np.abs(stamps - even)) > JITTER_SHARE * interval
     values = (column[tested] for column in (*w.T, *f.T))
-    return even_times.all_times(t) if has_jitter and _is_smoother(stamps, even, values) else t
+    return even_times.all_times(t) if has_jitter and _is_regular(stamps, even, values) else t
 
 
 class _EvenTimes:
@@ -105,7 +105,7 @@ class _EvenTimes:
         return even_times
 
 
-def _is_smoother(stamps: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
+def _is_regular(stamps: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
     """Return True if (m, 5) values are significantly smoother at even times than at stamps, s."""
     weights = _weights(stamps), _weights(even)
     gain = np.zeros(len(stamps))
@@ -117,7 +117,7 @@ def _is_smoother(stamps: Floats, even: Floats, columns: Iterable[Floats]) -> boo
         gain += np.clip((at_stamps - at_even) / max(np.median(at_stamps + at_even), rounding),
                         -10.0, 10.0)
     sums = np.array([group.sum() for group in np.array_split(gain, TESTED_GROUPS)])
-    return bool(sums.mean() > SMOOTHER_SIGMAS * sums.std() / np.sqrt(len(sums)))
+    return bool(sums.mean() > REGULAR_SIGMAS * sums.std() / np.sqrt(len(sums)))
 
 
 def _weights(times: Floats) -> Floats:

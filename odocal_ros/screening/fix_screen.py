@@ -163,8 +163,8 @@ def velocity_reasons(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Flo
     t_fix, geodetic, covariance = t_fix[inside], geodetic[inside], covariance_n[inside]
     if len(t_fix) < 2:
         return ()
-    rows = np.unique(np.searchsorted(t_fix[:-1], np.arange(t_fix[0], t_fix[-1],
-                                                           DISPLACEMENT_WINDOW)))
+    times = np.arange(t_fix[0], t_fix[-1], DISPLACEMENT_WINDOW)
+    rows = np.unique(np.searchsorted(t_fix[:-1], times))      # the next fix after each time
     meridian, normal = radii(geodetic[0, 0])
     D = np.diff(geodetic[rows, 1] * normal * np.cos(geodetic[0, 0])
                 + 1j * geodetic[rows, 0] * meridian)
@@ -172,7 +172,7 @@ def velocity_reasons(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Flo
     ends = t_fix[rows]
     V = np.diff(np.interp(ends, t, path))
     # motion in a gap of the velocity, or of the fixes, is not measured
-    gaps_before = running_sum(np.diff(t) > VELOCITY_GAP)
+    gaps_before = running_sum(np.diff(t) > VELOCITY_GAP)      # their number before each row
     begin, end = np.searchsorted(t, ends[:-1], side='right') - 1, np.searchsorted(t, ends[1:])
     complete = (gaps_before[begin] == gaps_before[end]) & (np.diff(ends) < 2 * DISPLACEMENT_WINDOW)
     V, D = V[complete], D[complete]

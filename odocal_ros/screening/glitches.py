@@ -44,19 +44,19 @@ DAMAGED_SHARE, SEVERAL_ROWS = 0.01, 4
 NEIGHBOUR_ROWS = 5          # rows without motion on each side of an isolated outlier
 # judgement, of a spike: least step from row to row, rad/s and m/s^2 (potholes are kept), and least
 # ratio of it to the median step; longest duration, s; largest share of the step that remains
-TURN_STEP, FORCE_STEP, USUAL_STEPS = 0.8, 50.0, 20.0
-GLITCH_TIME, RETURN_SHARE = 0.4, 0.5
+SPIKE_RATE, SPIKE_FORCE, SPIKE_RATIO = 0.8, 50.0, 20.0
+SPIKE_TIME, RETURN_SHARE = 0.4, 0.5
 # judgement, of an isolated outlier: least deviation from the mean of its two neighbours, rad/s
 # (0.003 rad in 0.1 s) and m/s^2, and least ratio of it to those of adjacent rows; largest
 # difference of its neighbours, over the deviation
-SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES = 0.03, 2.0, 10.0
+SINGLE_RATE, SINGLE_FORCE, SINGLE_RATIO = 0.03, 2.0, 10.0
 EQUAL_NEIGHBOURS = 0.3
 GLITCH_SHARE = 0.002      # largest share of glitches; with more, they are normal for the sensor
 ROLLING_SHARE = 0.1               # of the top speed: least mean speed of a moving vehicle
 # physical: smaller than the range of any sensor, larger than gravity at rest
 MIN_GYRO_RANGE, MIN_ACCELEROMETER_RANGE = 1.0, 1.5 * G      # rad/s, m/s^2
 # statistical: coarse steps also repeat the largest value, but less often than the next smaller one
-MIN_AT_LIMIT, TIMES_NEXT = 5, 3.0
+MIN_AT_LIMIT, MIN_COUNT_RATIO = 5, 3.0
 # judgement, of a dead band of the gyro: least share of zeros in motion, least number of different
 # rates up to twice the smallest one (coarse steps have one), and rows that are tested
 ZERO_SHARE, MIN_NEXT_RATES, DEAD_BAND_ROWS = 0.05, 5, 200_000
@@ -127,13 +127,13 @@ def find_spikes(t: Floats, x: Floats, min_step: float) -> Bools:
     large = np.flatnonzero(steps > min_step)
     if not len(large):
         return is_spike
-    jumps = large[steps[large] > USUAL_STEPS * median(steps)]
+    jumps = large[steps[large] > SPIKE_RATIO * median(steps)]
     end = -1      # of the last spike
     max_jumps = 2000    # jumps that are tested
     for row in jumps[:max_jumps]:
         if row < end:
             continue
-        stop = np.searchsorted(t, t[row] + GLITCH_TIME, side='right')
+        stop = np.searchsorted(t, t[row] + SPIKE_TIME, side='right')
         has_returned = np.abs(x[row + 2:stop] - x[row]).max(axis=1) <= RETURN_SHARE * steps[row]
         if has_returned.any():
             end = row + 2 + int(np.argmax(has_returned))
@@ -160,7 +160,7 @@ def isolated_outliers(x: Floats, min_deviation: float) -> Bools:
                                      for d in range(2, edge) for k in (-d, d)))
         deviation = deviations[NEIGHBOUR_ROWS:][:m]
         difference = np.abs(x[edge + 1:][:m] - x[NEIGHBOUR_ROWS:][:m])
-        is_isolated: Bools = ((deviation > np.maximum(min_deviation, SINGLE_TIMES * nearby))
+        is_isolated: Bools = ((deviation > np.maximum(min_deviation, SINGLE_RATIO * nearby))
                               & (difference < EQUAL_NEIGHBOURS * deviation))
         return reduce_columns(np.logical_or, is_isolated)
 
@@ -174,8 +174,8 @@ def isolated_outliers(x: Floats, min_deviation: float) -> Bools:
 def imu_glitches(t: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> Bools:
     """Return a mask of IMU rows that are spikes or isolated outliers; imu : its scale factors."""
     gyro, accel = max(imu.gyro_scale, 1e-12), max(imu.accel_scale, 1e-12)
-    return (find_spikes(t, w_i, TURN_STEP / gyro) | isolated_outliers(w_i, SINGLE_TURN / gyro)
-            | find_spikes(t, f_i, FORCE_STEP / accel)
+    return (find_spikes(t, w_i, SPIKE_RATE / gyro) | isolated_outliers(w_i, SINGLE_RATE / gyro)
+            | find_spikes(t, f_i, SPIKE_FORCE / accel)
             | isolated_outliers(f_i, SINGLE_FORCE / accel))
 
 
@@ -218,11 +218,7 @@ def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> t
 
 
 def dead_band_reasons(t: Floats, w: Floats, travel: Travel) -> tuple[Reason, ...]:
-    """
-    Return GYRO_DEAD_BAND if the gyro sends 0 for small turn rates while the wheels roll.
-
-    t, w : (n,) s, (n, 3) rad/s.   travel : of the odometer.
-    """
+    """Return GYRO_DEAD_BAND if rates w, (n, 3) rad/s, are 0 if small, while the wheels roll."""
     if len(t) < 2 or len(travel.t) < 2:
         return ()
     t, w = thinned(t, DEAD_BAND_ROWS), thinned(w, DEAD_BAND_ROWS)
@@ -240,7 +236,7 @@ def dead_band_reasons(t: Floats, w: Floats, travel: Travel) -> tuple[Reason, ...
         return ()
     zeros, axis, limit_deg = max(dead_bands)
     return (Reason(Code.GYRO_DEAD_BAND, f'the gyro sends 0 for turn rates below {limit_deg:.2g} '
-                   f'deg/s, axis {axis} in {100 * zeros:.0f} % of the messages in motion'),)
+                   f'deg/s, on axis {axis} in {100 * zeros:.0f} % of the messages in motion'),)
 
 
 def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
@@ -260,7 +256,7 @@ def saturation_reasons(t_imu: Floats, w_i: Floats, f_i: Floats,
                 if size < min_limit or count < MIN_AT_LIMIT:
                     continue
                 next_value = extreme(x, where=is_inside(x, limit), initial=no_value)
-                if count > TIMES_NEXT * np.count_nonzero(x == next_value):
+                if count > MIN_COUNT_RATIO * np.count_nonzero(x == next_value):
                     saturated.append((count, float(t_imu[at_limit.argmax()]),
                                       f'{sensor} {axis} saturates at {limit * scale:+.4g} {unit}'))
     if not saturated:

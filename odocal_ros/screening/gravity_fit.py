@@ -148,9 +148,11 @@ def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
         residual = force - X @ (solution / scale)
         variance = (np.abs(residual)**2).mean(axis=1)
         weight = 1 / np.maximum(variance + np.median(variance), 1e-12)
+    # sandwich: the scatter of the segments' scores, not their stated variance
     score = used[:, None] * (adjoint @ residual[..., None])[..., 0] / scale
     influence = np.abs(score @ inverse.T)[:, :3] / scale[:3]
     sigma = np.sqrt((influence**2).sum(axis=0) * n / (n - p))
+    # effective number of segments (Kish), from the information of each
     share = np.einsum('ij,kjl,li->ki', inverse, used[:, None, None] * normal, inverse).real[:, :3]
     segments = share.sum(axis=0)**2 / np.maximum((share**2).sum(axis=0), 1e-300)
     return GravityFit(solution[:3] / scale[:3], sigma, segments)

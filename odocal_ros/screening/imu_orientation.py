@@ -39,7 +39,7 @@ class Accelerations:
     """Specific force in the level plane and accelerations of the wheels, means over BIN_S."""
 
     e1: Floats           # (3,) level axes, in the frame of the IMU's data
-    e2: Floats
+    e2: Floats           # (3,)
     t: Floats            # (m,) s, middle of the bin
     force: Complexes     # (m,) m/s^2, by the IMU: along e1 + i times along e2
     forward: Floats      # (m,) m/s^2, acceleration by the odometer

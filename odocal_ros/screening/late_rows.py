@@ -47,22 +47,22 @@ def sampling_times(samples: OdometerSamples, t: Floats, form: OdometerForm,
     is_integer = np.issubdtype(samples.value.dtype, np.integer)
     if form.quantity == 'rate':
         # a speed is as smooth as travel, but does not determine the time of a row in a burst
-        rhythm, is_smoother = _smoothest_rhythm(t, samples.value.astype(float))
-        sampled = _rising(rhythm.t) if is_smoother else t
+        rhythm, is_regular = _smoothest_rhythm(t, samples.value.astype(float))
+        sampled_t = _rising(rhythm.t) if is_regular else t
     else:
         step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
                 else samples.value[1:].astype(float))
-        sampled = _correct_bursts(t, running_sum(step), ROUNDING_COUNTS if is_integer else 0.0)
-    delay = t - sampled
+        sampled_t = _correct_bursts(t, running_sum(step), ROUNDING_COUNTS if is_integer else 0.0)
+    delay = t - sampled_t
     min_delay, min_share = 0.02, 0.3    # s, of an interval: larger delays are reported
     late = delay > max(min_delay, min_share * intervals(t)[0])
     if not late.any():
-        return sampled, []
-    worst, bursts = int(np.argmax(delay)), int((np.diff(late.astype(int)) == 1).sum())
-    return sampled, [Reason(
+        return sampled_t, []
+    latest, bursts = int(np.argmax(delay)), int((np.diff(late.astype(int)) == 1).sum())
+    return sampled_t, [Reason(
         Code.ODOMETER_LATE, f'{int(late.sum())} of {len(t)} {name} messages arrived late, in '
-        f'{max(bursts, 1)} burst{"s" * (bursts > 1)}, by up to {delay[worst]:.3g} s at t = '
-        f'{t[worst]:.2f} s; moved back to their estimated times')]
+        f'{max(bursts, 1)} burst{"s" * (bursts > 1)}, by up to {delay[latest]:.3g} s at t = '
+        f'{t[latest]:.2f} s; moved back to their estimated times')]
 
 
 def arrival_jitter(t: Floats) -> float | None:
@@ -76,39 +76,40 @@ def arrival_jitter(t: Floats) -> float | None:
 
 def intervals(t: Floats) -> list[float]:
     """Return the possible intervals of the sender, s: with lost rows counted, and without."""
-    window = 5.0    # s over which means are taken
-    n = max(1, int(window * (len(t) - 1) / max(t[-1] - t[0], window)))
-    step = np.diff(t)
-    usual = median(step)
-    # if most rows have the same stamp, the median over windows is zero
-    mean = median(t[n:] - t[:-n]) / n or float(t[-1] - t[0]) / len(step)
+    window_s = 5.0    # over which means are taken
+    n = max(1, int(window_s * (len(t) - 1) / max(t[-1] - t[0], window_s)))      # its rows
+    step, duration = np.diff(t), t[n:] - t[:-n]
+    usual_s = median(step)
+    mean_s = median(duration) / n
+    if not mean_s:      # most rows have the same stamp
+        mean_s = float(t[-1] - t[0]) / len(step)
     max_difference = 0.005    # of the mean; if larger, rows are lost or have random delays
-    if abs(mean - usual) < max_difference * mean:
-        return [mean]
+    if abs(mean_s - usual_s) < max_difference * mean_s:
+        return [mean_s]
     min_share = 0.3    # of the intervals, within a quarter of the usual one
-    is_even = np.mean(np.abs(step - usual) < usual / 4) > min_share
+    is_even = np.mean(np.abs(step - usual_s) < usual_s / 4) > min_share
     # if more than half of the rows are lost, the median is not the interval
-    if not is_even or usual < mean / 2:
-        return [mean]
-    sent = running_sum(np.round(step / usual))    # number of rows, with the lost ones
-    return [median((t[n:] - t[:-n]) / np.maximum(sent[n:] - sent[:-n], 1.0)), mean]
+    if not is_even or usual_s < mean_s / 2:
+        return [mean_s]
+    sent_rows = running_sum(np.round(step / usual_s))    # number of rows, with the lost ones
+    return [median(duration / np.maximum(sent_rows[n:] - sent_rows[:-n], 1.0)), mean_s]
 
 
 def _correct_bursts(t: Floats, travel: Floats, rounding: float) -> Floats:
     """Return the sampling times of rows of travel, (n,); rounding: largest error of travel."""
-    rhythm, is_smoother = _smoothest_rhythm(t, travel)
+    rhythm, is_regular = _smoothest_rhythm(t, travel)
     min_delay, delay_share = 0.004, 0.1    # s, of an interval: the larger is the limit
-    late = t - rhythm.t > (rhythm.interval if is_smoother else
+    late = t - rhythm.t > (rhythm.interval if is_regular else
                            max(min_delay, delay_share * rhythm.interval))
-    sampled = (rhythm.t if is_smoother else t).copy()
+    sampled_t = (rhythm.t if is_regular else t).copy()
     spans = runs(late)
-    fits_rhythm = _fit_rhythm(spans, t, rhythm.t, travel, late, rounding)
+    fits_rhythm = _fits_rhythm(spans, t, rhythm.t, travel, late, rounding)
     for (begin, end), fits in zip(spans.tolist(), fits_rhythm.tolist(), strict=True):
         if fits:
-            sampled[begin:end] = rhythm.t[begin:end]
+            sampled_t[begin:end] = rhythm.t[begin:end]
         elif begin > 0 and end < len(t):
-            sampled[begin:end] = _times_by_travel(t, travel, begin - 1, end, rhythm.interval)
-    return _rising(sampled)
+            sampled_t[begin:end] = _times_by_travel(t, travel, begin - 1, end, rhythm.interval)
+    return _rising(sampled_t)
 
 
 def _rising(t: Floats) -> Floats:
@@ -117,18 +118,18 @@ def _rising(t: Floats) -> Floats:
     return np.asarray(np.maximum.accumulate(t - order) + order)
 
 
-def _fit_rhythm(spans: Ints, t: Floats, even: Floats, travel: Floats, late: Bools,
+def _fits_rhythm(spans: Ints, t: Floats, even: Floats, travel: Floats, late: Bools,
                 rounding: float) -> Bools:
     """Return True for each span of late rows, (k, 2), in which travel fits even times, (n,) s."""
     begin, end = spans.T
     if not len(begin):
         return np.zeros(0, bool)
     low, high = np.maximum(begin - NODE_STEP, 0), np.minimum(end + NODE_STEP, len(t))
-    tested = np.zeros(len(t) + 1, bool)
+    is_tested = np.zeros(len(t) + 1, bool)
     for shift in range(-NODE_STEP, NODE_STEP + 1):
-        tested[np.clip(np.flatnonzero(late) + shift, 0, len(t) - 1)] = True
+        is_tested[np.clip(np.flatnonzero(late) + shift, 0, len(t) - 1)] = True
     deviation = np.zeros((2, len(t) + 1))      # at stamps and at even times
-    rows = np.flatnonzero(tested)
+    rows = np.flatnonzero(is_tested)
     deviation[:, rows] = [_cubic_deviation(x, travel, rows) for x in (t, even)]
     # reduceat gives a sum for each run, and one between runs, which is not used
     ends = np.stack([low, high], -1).ravel()
@@ -139,14 +140,15 @@ def _fit_rhythm(spans: Ints, t: Floats, even: Floats, travel: Floats, late: Bool
 
 
 def _smoothest_rhythm(t: Floats, travel: Floats) -> tuple[Rhythm, bool]:
-    """Return the rhythm at which travel is smoothest, and True if it is smoother than at t."""
+    """Return the rhythm at which travel is smoothest, and True if rows are sampled on it."""
     # of equally smooth ones the first is used, by medians: that of the earliest rows has steps
     rhythms = [Rhythm(_roughness(t, even, travel), interval, even)
                for interval in reversed(intervals(t))
                for even in (*_rhythm_of_median(t, interval), _rhythm_of_earliest(t, interval))]
     lowest = min(rhythm.roughness for rhythm in rhythms)
-    smoother_limit, equal_ratio = 0.9, 1.1    # judgement: of the roughness, and over the lowest
-    if lowest >= smoother_limit:
+    # judgement: of a rhythm on which rows are sampled; of equal ones, over the lowest
+    max_roughness, equal_ratio = 0.9, 1.1
+    if lowest >= max_roughness:
         return rhythms[-1], False
     return next(rhythm for rhythm in rhythms if rhythm.roughness <= equal_ratio * lowest), True
 

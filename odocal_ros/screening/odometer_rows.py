@@ -43,27 +43,27 @@ def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
     False increments are interpolated.   name : of the odometer, in the reasons.
     """
     if form.quantity == 'cumulative':
-        false = false_counts(t, samples.value, form.modulus)
-        reasons = _false_row_reasons(false, t, f'{name} counts are frozen or isolated outliers',
-                                     'dropped')
-        samples, t = take(samples, ~false), t[~false]
+        is_false = false_counts(t, samples.value, form.modulus)
+        reasons = _false_row_reasons(is_false, t, f'{name} counts are frozen or isolated '
+                                     'outliers', 'dropped')
+        samples, t = take(samples, ~is_false), t[~is_false]
         is_new = ~repeated_counts(samples.value, form.modulus)
         return take(samples, is_new), t[is_new], reasons
     value = samples.value
     if form.quantity == 'rate':
         return samples, t, []
-    false = speed_glitches(t, value.astype(float))
-    if false.any():
-        interpolated = np.interp(t, t[~false], value[~false].astype(float))
-        corrected: NDArray[Any] = np.where(false, interpolated, value).astype(value.dtype)
+    is_false = speed_glitches(t, value.astype(float))
+    if is_false.any():
+        interpolated = np.interp(t, t[~is_false], value[~is_false].astype(float))
+        corrected: NDArray[Any] = np.where(is_false, interpolated, value).astype(value.dtype)
         samples = replace(samples, value=corrected)
-    return samples, t, _false_row_reasons(false, t, f'{name} increments are isolated outliers',
+    return samples, t, _false_row_reasons(is_false, t, f'{name} increments are isolated outliers',
                                           'replaced by interpolation')
 
 
-def _false_row_reasons(false: Bools, t: Floats, fault: str, action: str) -> list[Reason]:
-    return [Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {fault}, first at t = '
-                   f'{t[np.argmax(false)]:.2f} s; {action}')] if false.any() else []
+def _false_row_reasons(is_false: Bools, t: Floats, fault: str, action: str) -> list[Reason]:
+    return [Reason(Code.BAD_ROWS_DROPPED, f'{int(is_false.sum())} of {len(t)} {fault}, first at t '
+                   f'= {t[np.argmax(is_false)]:.2f} s; {action}')] if is_false.any() else []
 
 
 def counter_steps(value: Values, modulus: int) -> Floats:
@@ -78,10 +78,10 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     Rows before a jump are false if the counter was frozen there: its jump is the travel since it
     stopped. Rows between a jump and a jump back are false.
     """
-    false = np.zeros(len(t), bool)
+    is_false = np.zeros(len(t), bool)
     step = counter_steps(value, modulus)
     if len(step) < MIN_STEPS or not step.any():
-        return false
+        return is_false
     dt = np.diff(t)
     rate = step / np.maximum(dt, np.median(dt))
     size = np.abs(rate)
@@ -89,7 +89,7 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     jumps = np.flatnonzero(size > max(RESET_FACTOR * high_rate, 3 / np.median(dt))).tolist()
     max_jumps = 200    # with more the counter is not corrected; the check decides
     if len(jumps) > max_jumps:
-        return false
+        return is_false
     last_false = -1
     max_duration = 30.0    # s between a jump and the jump back
     for jump in jumps:
@@ -104,10 +104,10 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
             jumps_back = first == jump and abs(travel) <= max_travel and (
                 min(abs(step[first]), abs(step[last])) > 2 * max_travel)
             if jumps_back or _fits_adjacent_rates(t, travel, rate, first, last):
-                false[first + 1:last + 1] = True
+                is_false[first + 1:last + 1] = True
                 last_false = last
                 break
-    return false
+    return is_false
 
 
 def repeated_counts(value: Values, modulus: int) -> Bools:
@@ -131,6 +131,7 @@ def repeated_counts(value: Values, modulus: int) -> Bools:
     next_update = np.searchsorted(update, row)
     rows_to_update = np.append(update, row[-1])[next_update] - row
     intervals_to_update = np.floor(rows_to_update / np.mean(interval_rows[is_moving]))
+    # in motion a row repeats the value until the next update
     intervals_to_update[np.r_[False, is_moving, False][next_update]] = 0.0
     same_interval = np.append(intervals_to_update[1:] == intervals_to_update[:-1], False)
     return np.asarray(np.append(False, size == 0) & same_interval)

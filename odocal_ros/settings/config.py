@@ -36,7 +36,7 @@ def _place(about: str) -> Any:
     return setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, read_only=True, about=about)
 
 
-def _arrival() -> Any:
+def _arrival_time() -> Any:
     """Declare whether messages are stamped by their arrival."""
     return setting(False, read_only=True, about=(
         'Use the arrival time of messages instead of their stamp: for stamps that are 0 or from '
@@ -44,7 +44,7 @@ def _arrival() -> Any:
 
 
 def _figure(unit: str, high: float, about: str, nan: str = 'value of the grade') -> Any:
-    """Declare an error figure of an IMU; ``nan`` : meaning of NaN, its default."""
+    """Declare an error of an IMU, 1 sigma; ``nan`` : meaning of NaN, its default."""
     return setting(NAN, unit, 0.0, high, about=f'{about}; NaN: {nan}.')
 
 
@@ -70,7 +70,7 @@ class OdometerConfig:
                                          'the nominal scale; beyond it the verdict is caution.')
     lever_arm: tuple[float, ...] = _place('Wheel contact point in base_link (forward, left, up).')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to odometer stamps.')
-    arrival_time: bool = _arrival()
+    arrival_time: bool = _arrival_time()
     # latency of a bus and a middleware is rarely less; u-blox requires 10 ms or better
     time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown delay of the odometer, 1 '
                                 'sigma; matters in turns and at marks set in motion.')
@@ -148,7 +148,7 @@ class ImuConfig:
         'and axes (not the mounting) are used like one more leg of the smoother.'))
     lever_arm: tuple[float, ...] = _place('IMU position in base_link.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to IMU stamps.')
-    arrival_time: bool = _arrival()
+    arrival_time: bool = _arrival_time()
     nominal_yaw: float = setting(NAN, 'rad', about='Expected yaw mounting angle; a result far '
                                  'from it is a caution. NaN: not checked.')
 
@@ -160,13 +160,13 @@ class GnssConfig:
     lever_arm_sigma: float = setting(0.1, 'm', 0.0, 10.0, about='Uncertainty of the antenna '
                                      'position, each axis.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to fix stamps.')
-    arrival_time: bool = _arrival()
+    arrival_time: bool = _arrival_time()
     time_sigma: float = setting(0.05, 's', 0.0, 1.0, about='Unknown delay of fixes, 1 sigma; '
                                 'matters at marks set in motion.')
     min_status: int = setting(0, '', -1, 2, about='Minimum NavSatStatus of a used fix.')
     max_sigma: float = setting(NAN, 'm', 0.0, 1e4, about='Limit of the horizontal 1 sigma of a '
                                'used fix; NaN: 3 m, or twice the median of the leg if that is '
-                               'larger; 0: off.')
+                               'larger; 0: no limit.')
     default_sigma: float = setting(2.5, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of fixes '
                                    'without a covariance.')
     correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Correlation time of fix errors; '
@@ -190,7 +190,8 @@ class LegConfig:
     max_gap: float = setting(0.5, 's', 0.05, 10.0, about='Limit of an IMU gap; at a longer gap '
                              'the leg is cut.')
     standstill: float = setting(2.0, 's', 0.2, 600.0, about='Minimum duration of a standstill.')
-    preroll: float = setting(600.0, 's', 0.0, 7200.0, about='Data kept before the start mark.')
+    preroll: float = setting(600.0, 's', 0.0, 7200.0, about='Duration of the data that are '
+                             'used from before the start mark.')
     compute_limit: int = setting(40, 'passes', 5, 1000, about='Largest number of passes of a fit; '
                                  'a pass processes one keyframe per second of the leg. At the '
                                  'limit the best estimate is used, with a sigma of four times '
@@ -227,8 +228,8 @@ class WheelsConfig:
     pulses_per_revolution: float = setting(0.0, 'pulses', 0.0, 1e9, about='Pulses per turn of the '
                                            'wheel; with the radius it gives the nominal scale.')
     radius_range: float = setting(0.0, '1', 0.0, 0.9, about='Half width of the search range '
-                                  "around each wheel's nominal factor, relative: twice the "
-                                  'stated error; 0: 0.05.')
+                                  "around each wheel's nominal scale factor, relative, such as "
+                                  'twice its tolerance; 0: 0.05 is used.')
     heading_range: float = setting(0.0, 'rad', 0.0, 3.2, about='Half width of the search range '
                                    'of the initial heading; 0: twice its sigma, or 0.17 rad if '
                                    'that is unknown.')

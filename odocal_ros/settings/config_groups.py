@@ -25,7 +25,8 @@ class ReferenceConfig:
     start: tuple[float, ...] = setting((), 'deg, deg, m, m', about='Surveyed antenna position at '
                                        'the start mark: latitude, longitude, ellipsoidal height, '
                                        'sigma; empty: from fixes.')
-    end: tuple[float, ...] = setting((), 'deg, deg, m, m', about='The same at the end mark.')
+    end: tuple[float, ...] = setting((), 'deg, deg, m, m', about='As reference.start, at the end '
+                                     'mark.')
     latitude_deg: float = setting(NAN, 'deg', -85.0, 85.0, read_only=True, about=(
         'Latitude of the site, for positions in a local frame (poses instead of GNSS fixes). It '
         'gives gravity and the vertical Earth rate. NaN: gravity of 45 deg; the Earth rate, up to '
@@ -166,7 +167,7 @@ class VerdictConfig:
                                      'scale factor.')
     max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Required sigma of the yaw '
                                    'mounting angle.')
-    min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
+    min_legs: int = setting(1, '', 1, 100, about='Required number of legs; fewer are a caution.')
     scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='Random walk of '
                                          'the scale factor between legs, relative, 1 sigma '
                                          '(tyres).')

@@ -17,8 +17,9 @@ class StartConfig:
     attitude: tuple[float, ...] = setting((), 'x, y, z, w', -1.0, 1.0, read_only=True, about=(
         'Attitude of the IMU (body frame b) in the odom frame at the first message, from another '
         'system; empty: levelled by the accelerometer, heading along x.'))
-    gyro_bias: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'rad/s', -1.0, 1.0, about=(
-        'Gyro bias in b that belongs to this attitude.'), read_only=True)
+    gyro_bias: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'rad/s', -1.0, 1.0, read_only=True,
+                                           about='Gyro bias in body frame b that belongs to '
+                                           'start.attitude.')
     latitude: float = setting(NAN, 'deg', -90.0, 90.0, read_only=True, about=(
         'Latitude, if the attitude is given in east-north-up: the Earth rate is removed from '
         'the turn rates. NaN: it remains in the gyro bias measured at rest.'))

@@ -15,11 +15,9 @@ G = 9.80665          # m/s^2, definition: standard gravity (CGPM 1901), of data 
 
 def nominal_scale(config: Config, unit: str) -> float:
     """
-    Return the nominal scale factor K0: the setting, else from the settings of the wheel.
+    Return the nominal scale factor K0: the setting, else from the settings of the wheel, else 0.
 
     unit : of the scale factor: m/pulse, m/rad, or 1 for a speed, whose nominal scale factor is 1.
-
-    Returns 0 if the settings do not give it.
     """
     if config.odometer.nominal_scale:
         return config.odometer.nominal_scale
@@ -134,15 +132,13 @@ def with_grade_by_noise(imu: ImuConfig, variance: Mapping[str, float]) -> ImuCon
     """
     Return the imu settings, with a worse grade if that fits the noise at rest better.
 
-    With too good a grade, priors would be too narrow.
-
-    variance : of the white noise at rest of 'gyro', (rad/s)^2/Hz, and 'accel', (m/s^2)^2/Hz;
-    empty: not known.
+    With too good a grade, priors would be too narrow.   variance : of the white noise at rest of
+    'gyro', (rad/s)^2/Hz, and 'accel', (m/s^2)^2/Hz; empty: not known.
     """
     if not variance:
         return imu
     names = list(GRADES)
-    not_better = names[:names.index(imu.grade) + 1]
+    candidates = names[names.index(imu.grade)::-1]      # the configured grade, then worse ones
 
     def misfit(candidate: ImuConfig) -> float:
         """Return the sum of the logarithms of stated over measured noise, without signs."""
@@ -152,11 +148,11 @@ def with_grade_by_noise(imu: ImuConfig, variance: Mapping[str, float]) -> ImuCon
                    for name, sigma in stated.items() if name in variance)
 
     # if several are equally good, the configured grade, which is the first one
-    return min((replace(imu, grade=name) for name in reversed(not_better)), key=misfit)
+    return min((replace(imu, grade=name) for name in candidates), key=misfit)
 
 
 def grade_of(imu: ImuConfig) -> Grade:
-    """Return the errors of the configured grade, or as configured one by one (NaN: not)."""
+    """Return the errors of the configured grade, or the configured ones (NaN: not configured)."""
     grade = GRADES[imu.grade]
     configured = {name: getattr(imu, name) for name in asdict(grade)}
     return replace(grade, **{name: value for name, value in configured.items()

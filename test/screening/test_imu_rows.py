@@ -217,5 +217,5 @@ def test_a_gyro_without_small_rates_in_motion_has_a_dead_band(rng, kind):
     assert [r.code for r in reasons] == [Code.GYRO_DEAD_BAND] * (kind == 'dead band')
     if reasons:
         # of x, with a sigma of 0.15 deg/s: two sigma
-        assert reasons[0].text == ('the gyro sends 0 for turn rates below 0.3 deg/s, axis x in '
+        assert reasons[0].text == ('the gyro sends 0 for turn rates below 0.3 deg/s, on axis x in '
                                    '95 % of the messages in motion')

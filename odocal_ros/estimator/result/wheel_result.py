@@ -117,20 +117,20 @@ def _track_width(left: Wheel, right: Wheel, configured: float) -> tuple[Estimate
     """Return the track width and its reasons, (W8); configured : m, 0: unknown."""
     width, sigma = left.y - right.y, left.y_sigma + right.y_sigma
     unknown = Estimate(None, None, 'm')
-    if configured and sigma >= levels.INFORMED_SHARE * TRACK_WIDTH.taped_share * configured:
+    if configured and sigma >= levels.INFORMED_SHARE * TRACK_WIDTH.tape_share * configured:
         return unknown, []         # the configured width is more accurate
-    if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
+    if sigma < TRACK_WIDTH.minimum and width < TRACK_WIDTH.minimum:
         return unknown, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
                              f'match the gyro turns: the track width would be {width:.2g} m; '
-                             f'the lower limit is {TRACK_WIDTH.least:g} m',
+                             f'the lower limit is {TRACK_WIDTH.minimum:g} m',
                              'Check that odometer.left and odometer.right are the wheels of one '
                              'axle, or set odometer.track_width.')]
-    limit = TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least)
+    limit = TRACK_WIDTH.max_sigma_share * max(width, TRACK_WIDTH.minimum)
     if sigma >= limit:
         return unknown, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
                              f'{sigma:.2g} m; the limit is {limit:.2g} m. Likely cause: too few '
                              'turns')]
-    limit = levels.REMARK_SIGMAS * float(np.hypot(TRACK_WIDTH.taped_share * configured, sigma))
+    limit = levels.REMARK_SIGMAS * float(np.hypot(TRACK_WIDTH.tape_share * configured, sigma))
     if configured and abs(width - configured) > limit:
         return Estimate(width, sigma, 'm'), [Reason(
             Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.3f} ± '

@@ -139,7 +139,7 @@ class _Signals:
         is_left = i % 2 == 0
         if is_left and i == len(self.leg.wheels) - 1:
             return 0.0
-        return (width or TRACK_WIDTH.of_a_car) / 2 * (1 if is_left else -1)
+        return (width or TRACK_WIDTH.typical) / 2 * (1 if is_left else -1)
 
     def _steering_path(self, state: layout.State, up: Floats, i: int) -> Floats:
         """Return the increments of q of a steered wheel, (W9): (k - 1,) 1/m."""
@@ -158,8 +158,8 @@ class _Signals:
         y0 = self._prior_y(i, width)
         X = np.stack([self.path, -self.turn, self.speed_change, y0 * self.rate_change,
                       y0 * self.T], -1)
-        width_sigma = TRACK_WIDTH.taped_share * width / 2
-        prior = np.array([1.0, width_sigma or TRACK_WIDTH.any_sigma, WHEEL_DELAY_SIGMA,
+        width_sigma = TRACK_WIDTH.tape_share * width / 2
+        prior = np.array([1.0, width_sigma or TRACK_WIDTH.unknown_sigma, WHEEL_DELAY_SIGMA,
                           max(delay, 1e-4), max(drift, 1e-9)])
         mean = np.array([0.0, y0 if width_sigma else 0.0, 0.0, 0.0, 0.0])
         if i in self.steering_paths:
