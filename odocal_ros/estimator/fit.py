@@ -121,7 +121,10 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
         if progress.converged or count >= max_iterations:
             break
         if count == outlier_passes.start and not has_sample_sizes:
-            problem.rows_per_independent = find_rows_per_independent(problem, weighted)
+            # of other sensors, and of speed steps, whose errors repeat at constant acceleration
+            problem.rows_per_independent = {
+                name: rows_per_independent(rows) for name, rows in weighted.factors.items()
+                if name in (*problem.external, SpeedSteps.name) and isinstance(rows, PointRows)}
         if not frozen:
             marginals = solved.marginals()
             levels = level_steps.update(weighted, marginals, progress.was_fitted)
@@ -182,13 +185,6 @@ def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
     # half the change in the logarithm: adjacent intervals share a slip and would oscillate
     new_factors[:, :factor.JUMP] = np.sqrt(variance_factors * new_factors)[:, :factor.JUMP]
     return new_factors
-
-
-def find_rows_per_independent(problem: Problem, weighted: Weighted) -> dict[str, float]:
-    """Return rows per independent row of other sensors and of speed steps, by sensor."""
-    # errors of speed steps repeat at constant acceleration
-    return {name: rows_per_independent(rows) for name, rows in weighted.factors.items()
-            if name in (*problem.external, SpeedSteps.name) and isinstance(rows, PointRows)}
 
 
 def relax_priors(initial: Priors, current: Priors, state: State, solved: Solved,

@@ -25,13 +25,7 @@ from odocal_ros.data.arrays import (
     runs,
 )
 from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.nav.rotations import (
-    matrix_from_quat,
-    quat_conjugate,
-    quat_from_rotvec,
-    quat_multiply,
-    rotvec_from_quat,
-)
+from odocal_ros.nav import rotations
 from odocal_ros.nav.strapdown import prefix_product, rotation_increments
 from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.nominal import G, Grade
@@ -155,12 +149,12 @@ def _summed(leg: SmootherLeg, edges: Ints) -> dict[str, Floats]:
     step = np.repeat(np.arange(len(first)), np.diff(edges))     # of each sample
     dt = np.diff(t)[:, None]
     turn = rotation_increments(leg.t_imu, leg.w_b, edges[0], edges[-1]).T
-    q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], quat_from_rotvec(turn)]))
-    to_start = quat_conjugate(q[first])[step]
-    at_end = quat_multiply(to_start, q[1:])
+    q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], rotations.quat_from_rotvec(turn)]))
+    to_start = rotations.quat_conjugate(q[first])[step]
+    at_start, at_end = (rotations.quat_multiply(to_start, x) for x in (q[:-1], q[1:]))
     # specific force at both ends of a sample interval, in the axes at the start of its step
-    f_start = np.einsum('nij,nj->ni', matrix_from_quat(quat_multiply(to_start, q[:-1])), f[:-1])
-    f_end = np.einsum('nij,nj->ni', matrix_from_quat(at_end), f[1:])
+    f_start, f_end = (np.einsum('nij,nj->ni', rotations.matrix_from_quat(attitude), force)
+                      for attitude, force in ((at_start, f[:-1]), (at_end, f[1:])))
     last = np.append(first[1:], len(dt)) - 1
 
     def running(x: Floats) -> tuple[Floats, Floats]:
@@ -174,8 +168,8 @@ def _summed(leg: SmootherLeg, edges: Ints) -> dict[str, Floats]:
     signals = np.concatenate([turn, (f[:-1] + f[1:]) / 2 * dt], axis=1)
     angle, _ = running(turn)
     mean = np.add.reduceat((angle + turn / 2) * dt, first) / np.add.reduceat(dt, first)
-    return {'turn': rotvec_from_quat(at_end[last]), 'turn_mean': mean, 'dv': dv, 'dp': dp,
-            'signals': np.add.reduceat(signals, first),
+    return {'turn': rotations.rotvec_from_quat(at_end[last]), 'turn_mean': mean,
+            'dv': dv, 'dp': dp, 'signals': np.add.reduceat(signals, first),
             'longest': np.maximum.reduceat(dt[:, 0], first)}
 
 

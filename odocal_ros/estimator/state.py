@@ -54,9 +54,9 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_delay', 'gnss_delay', 'heading_offset', 'fix_motion_time',
              *GYRO_ERRORS, *ACCEL_ERRORS,
              'fix_lag_square', 'fix_error_by_motion', 'gnss_clock_rate', 'odometer_clock_rate',
-             'odometer_lag_square',
-             'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
-             'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
+             'odometer_lag_square', 'scale_by_speed', 'scale_by_time', 'scale_by_pull',
+             'scale_by_braking', 'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk',
+             'sideslip_by_jerk',
              'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns',
              'body_centre_height', 'sway_by_force', 'lift_by_turning', 'mean_roll',
              'fix_height_drift', 'fix_error_east', 'fix_error_north', 'fix_error_up',
@@ -128,11 +128,10 @@ IMPERFECTIONS = constants_from('gyro_scale_z', 'sway_by_force')
 # their kinds, with one common size each: numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
-              'clock_rate': 2, 'odometer_lag_square': 1,
-              'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2,
-              'scale_by_pitching': 1, 'squat': 1, 'sideslip': 1, 'squat_by_jerk': 1,
-              'sideslip_by_jerk': 1, 'pitch_centre': 2, 'pitch_centre_in_turns': 1,
-              'body_centre_height': 1, 'sway_by_force': 1}
+              'clock_rate': 2, 'odometer_lag_square': 1, 'scale_by_speed': 1, 'scale_by_time': 1,
+              'scale_by_force': 2, 'scale_by_pitching': 1, 'squat': 1, 'sideslip': 1,
+              'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 2,
+              'pitch_centre_in_turns': 1, 'body_centre_height': 1, 'sway_by_force': 1}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECTIONS
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')
@@ -159,7 +158,7 @@ class State:
     accel_bias: Floats    # (N, 3) m/s^2, in b
     travel_error: Floats  # (N,) scale units
     slow_n: Floats        # (N, 3) m, time-correlated fix error
-    constants: Floats     # (M,) as CONSTANTS, ln K first
+    constants: Floats     # (M,) in the order of CONSTANTS, ln K first
     # (3,) up axis of n in b, mean of the leg, which gives the roll of the IMU in the vehicle
     up_b: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 

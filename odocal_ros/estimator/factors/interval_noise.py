@@ -184,8 +184,8 @@ class IntervalNoise:
         return Q
 
 
-def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
-                   variance_factors: Floats | None) -> IntervalNoise:
+def motion_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
+                 variance_factors: Floats | None) -> IntervalNoise:
     """
     Return the noises of a motion.
 

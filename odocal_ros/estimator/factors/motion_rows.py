@@ -15,12 +15,7 @@ import numpy as np
 from odocal_ros.data.arrays import blocks, Bools, Floats, work_array
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, IMU, LinearisationPoint
-from odocal_ros.estimator.factors.interval_noise import (
-    ALONG,
-    INTERVAL,
-    interval_noise,
-    road_levels,
-)
+from odocal_ros.estimator.factors.interval_noise import ALONG, INTERVAL, motion_noise, road_levels
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer import SpeedSteps
 from odocal_ros.estimator.factors.signals import Signals
@@ -52,8 +47,8 @@ class MotionRows(Factor):
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
         self.signals = Signals(self.motion)
         intervals_at_rest = problem.at_rest[:-1] & problem.at_rest[1:]
-        self.noise = interval_noise(self.motion, problem.leg, intervals_at_rest,
-                                    point.variance_factors)
+        self.noise = motion_noise(self.motion, problem.leg, intervals_at_rest,
+                                  point.variance_factors)
 
     @classmethod
     def initial_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.result import AS_SENT, Calibration, Estimate, LegResult, MethodResult
+from odocal_ros.calib.result import AS_SENT, Calibration, Estimate, MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
@@ -227,7 +227,9 @@ class TwistNoise:
 def twist_noise(calibration: Calibration) -> TwistNoise | None:
     """Return the errors of the twist, None without a scale factor of the smoother."""
     scale = calibration.estimates.get('scale_factor')
-    legs = _fitted_details(calibration.legs)
+    fitted = [leg.methods['smoother'].details for leg in calibration.legs
+              if 'smoother' in leg.methods and leg.verdict.value != 'rejected']
+    legs = tuple({'wheels': {}, **details} for details in fitted if 'odometer' in details)
     if scale is None or not scale.value or scale.method != 'smoother' or not legs:
         return None
     odometers = [leg['odometer'] for leg in legs]
@@ -236,13 +238,6 @@ def twist_noise(calibration: Calibration) -> TwistNoise | None:
     return TwistNoise(float(np.median([o['period'] for o in odometers])), speed, turn_rate,
                       (max(o['fastest'] for o in odometers),
                        max(o['fastest_turn'] for o in odometers)), legs, calibration.estimates)
-
-
-def _fitted_details(legs: Sequence[LegResult]) -> tuple[dict[str, Any], ...]:
-    """Return the details of the legs that the smoother fitted and nothing rejects."""
-    fitted = [leg.methods['smoother'].details for leg in legs
-              if 'smoother' in leg.methods and leg.verdict.value != 'rejected']
-    return tuple({'wheels': {}, **details} for details in fitted if 'odometer' in details)
 
 
 def _mean_square(effect: dict[str, float]) -> float:

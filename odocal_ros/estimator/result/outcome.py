@@ -221,25 +221,22 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
     return {
         'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
         'correlation': correlations(fit.covariance[:3, :3], PARAMETERS),
-        'f': K * state.forward, 'C_bv': state.C_bv,
-        'noise': fit.levels.sigmas(),
+        'f': K * state.forward, 'C_bv': state.C_bv, 'noise': fit.levels.sigmas(),
         'iterations': fit.iterations, 'widened': float(factor),
-        'external': _external_details(problem, fit, sigma),
-        'posterior_to_prior': ratio,
+        'external': _external_details(problem, fit, sigma), 'posterior_to_prior': ratio,
         **{layout.CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in IMPERFECTION_CONSTANTS},
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
                       'fix_correlation_2s': residuals.correlation(t_fix, fixes.r[:, :2]),
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
-                      'fixes': len(t_fix),
-                      'normalised': residuals.normalised_residuals(fit.weighted),
+                      'fixes': len(t_fix), 'normalised': residuals.normalised_residuals(
+                          fit.weighted),
                       'intervals_slipping': int(
                           (fit.variance_factors[:, 0] > residuals.SLIP_VARIANCE).sum())},
         'excitation': {'distance': residuals.path_length(fit),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float((motion.turning * motion.T[:, 0]).sum()),
-                       'in_turns': problem.total_turn,
-                       'standing': float(problem.at_rest.sum())},
+                       'in_turns': problem.total_turn, 'standing': float(problem.at_rest.sum())},
         'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
         'key_t': state.t, 'key_C_nb': state.C_nb, 'gyro_bias': state.gyro_bias.mean(axis=0),
         'key_biases': np.stack([state.gyro_bias, state.accel_bias])}
