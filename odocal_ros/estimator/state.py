@@ -64,9 +64,9 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'pressure_offset', 'pressure_drift', 'pressure_by_speed_square', 'pressure_scale')
 
 
-def constants_from(first: str, last: str = '') -> slice:
-    """Return the slice of constants from ``first`` to ``last``, included; without it, of one."""
-    return slice(CONSTANTS.index(first), CONSTANTS.index(last or first) + 1)
+def constants_from(first: str, last: str | None = None) -> slice:
+    """Return the slice of constants from ``first`` to ``last``, included; None: of one."""
+    return slice(CONSTANTS.index(first), CONSTANTS.index(first if last is None else last) + 1)
 
 
 LN_K, YAW, PITCH = map(CONSTANTS.index, ('scale_factor', 'yaw_mounting_angle',

@@ -136,9 +136,9 @@ class FrameChain:
         stamps, received = np.array(corrected.stamps[:n]), np.array(corrected.received[:n])
         position, is_usable = np.zeros((n, 3)), np.ones(n, bool)
         if others:      # a repeated correction gives no position
-            before = [self._last_correction or corrected.values[0], *corrected.values]
+            last = corrected.values[0] if self._last_correction is None else self._last_correction
             is_usable = np.array([a != b for a, b in zip(
-                before, corrected.values[:n], strict=False)])
+                [last, *corrected.values], corrected.values[:n], strict=False)])
             self._last_correction = corrected.values[n - 1]
         for name in reversed(self._path):
             if name not in self._moving:

@@ -60,7 +60,7 @@ class Travel:
             return np.where(((t[:, None] >= spans[:, 0]) & (t[:, None] < spans[:, 1])).any(axis=1),
                             -1.0, 1.0)
         step = np.diff(self.s, prepend=self.s[:1]) * sign(self.t)
-        coarse = self.coarse and self.coarse.mirrored(sign(self.coarse.t))
+        coarse = None if self.coarse is None else self.coarse.mirrored(sign(self.coarse.t))
         return replace(self, s=self.s[:1] + np.cumsum(step), coarse=coarse)
 
 

@@ -175,15 +175,16 @@ class Motion:
         self.up_n, forward_n = C_mean @ self.up, C_mean @ self.state.forward
 
         def slope(x: Floats) -> tuple[Floats, Floats]:
+            """Return the slope of displacements relative to the body, and that per metre up."""
             along = np.einsum('ki,ki->k', x, forward_n)
             size = np.maximum(along**2, (WALK_SPEED * self.T[:, 0])**2)
             return np.einsum('ki,ki->k', x, self.up_n) * along / size, along / size
 
-        of_body, _ = slope(straight)
+        wheel_slope, _ = slope(straight)
         inclination, per_metre = slope(self.displacement_by_state)
         self.slope_gradient = inclination * per_metre / (1 + inclination**2)
         bounce = squared_bounce(inclination, self.displacement_by_state[:, 2] * per_metre)
-        return np.sqrt((1 + of_body**2 + bounce) / (1 + inclination**2))
+        return np.sqrt((1 + wheel_slope**2 + bounce) / (1 + inclination**2))
 
     def _derivative_by_slope(self, C: Floats, arm_b: Floats, sign: float) -> Floats:
         """Return derivatives by position and attitude at start or end, sign -1, 1: (K, 3, 6)."""
