@@ -127,7 +127,7 @@ def test_odocal_commands_give_stated_results(page, line, tmp_path, monkeypatch, 
     elif words[0] == 'plan':
         assert 'predicted sigma' in out
     elif words[0] == 'try':
-        assert f'next time:\n  odocal replay {words[1]} ' in out
+        assert f'to repeat this calibration:\n  odocal replay {words[1]} ' in out
     elif words[0] == 'inspect':
         assert '<- imu' in out
         assert 'suggested command' in out

@@ -120,9 +120,7 @@ def _existing_row(store: rows.RowStore, job: BagJob, fingerprint: str) -> rows.R
         return store.get(key)
     failed = store.get(job.failed_key)
     # a bag that ended its worker may have no fingerprint: only its path is known
-    if failed is not None and failed.seen in ('', fingerprint):
-        return failed
-    return None
+    return failed if failed and failed.seen in ('', fingerprint) else None
 
 
 def _compute_row(job: BagJob, store: rows.RowStore, fingerprint: str,

@@ -3,7 +3,7 @@
 
 """The bags of a fleet, and the vehicle of each."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -79,9 +79,9 @@ def _bag_of_path(bag: str, pattern: re.Pattern[str] | None) -> FleetBag:
                     _odometer_km(groups.get('odometer_km'), bag))
 
 
-def _odometer_km(value: Any, origin: str) -> float | None:
-    """Return a reading in km, None if it is missing (None, empty or NaN)."""
-    if value in (None, '') or value != value:
+def _odometer_km(value: str | None, origin: str) -> float | None:
+    """Return a reading in km, None if it is missing."""
+    if not value:
         return None
     try:
         return float(value)
@@ -110,24 +110,26 @@ def _read_manifest(name: str) -> list[FleetBag]:
         fault = f'no column {" and ".join(sorted(missing))}' if missing else 'it has no bag'
         raise BadUsage(f'{name}: {fault}; '
                        f'required columns: vehicle, bag; optional: {", ".join(COLUMNS[2:])}')
-    columns = [column for column in COLUMNS if column in table.column_names]
-    root = name[:len(name) - len(PurePosixPath(name).name)]
-    bags = []
-    for number, row in enumerate(table.select(columns).to_pylist(), 2):
-        cells = {column: str(value) for column, value in row.items() if value is not None}
-        if not (cells.get('vehicle') and cells.get('bag')):
-            raise BadUsage(f'{name}, row {number}: vehicle or bag is empty')
-        bags.append(FleetBag(
-            cells['vehicle'], _resolve_path(root, cells['bag']), cells.get('model', ''),
-            _odometer_km(cells.get('odometer_km'), f'{name}, row {number}'),
-            _resolve_path(root, cells['config']) if cells.get('config') else '',
-            tuple(cells.get('legs', '').split())))
-    return bags
+    root = name.removesuffix(PurePosixPath(name).name)
+    return [bag_of_row(row, root, f'{name}, row {number}')
+            for number, row in enumerate(table.to_pylist(), 2)]
 
 
-def _resolve_path(root: str, path: str) -> str:
-    """Return a path or URL; a relative path is in the folder ``root``, which ends with /."""
-    return path if '://' in path or path.startswith('/') else root + path
+def bag_of_row(row: Mapping[str, Any], root: str, origin: str) -> FleetBag:
+    """
+    Return the bag in a row of a manifest or a DataFrame, whose empty cells are None, '' or NaN.
+
+    root : folder of relative paths, ends with / or is empty.   origin : of the row, for BadUsage.
+    """
+    cells = {column: str(value) for column in COLUMNS
+             if (value := row.get(column)) is not None and value == value}
+    if not (cells.get('vehicle') and cells.get('bag')):
+        raise BadUsage(f'{origin}: vehicle or bag is empty')
+    bag, config = (path if not path or '://' in path or path.startswith('/') else root + path
+                   for path in (cells['bag'], cells.get('config', '')))
+    return FleetBag(cells['vehicle'], bag, cells.get('model', ''),
+                    _odometer_km(cells.get('odometer_km'), origin), config,
+                    tuple(cells.get('legs', '').split()))
 
 
 def file_system(url: str) -> tuple[Any, str]:

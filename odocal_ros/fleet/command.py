@@ -8,7 +8,7 @@ Imports of Dask and the pipeline are inside functions, so that --help stays quic
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 import re
@@ -150,10 +150,11 @@ def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
     from odocal_ros.fleet.engine import check_installed, engine, MEMORY
     check_installed()
     from odocal_ros.fleet.bag_jobs import bag_jobs
-    from odocal_ros.fleet.bags import find_bags
+    from odocal_ros.fleet.bags import bag_of_row, find_bags
     vehicle_from = options.pop('vehicle_from', None)
     if hasattr(bags, 'to_dict'):
-        fleet_bags = [_bag_of_row(row) for row in bags.to_dict('records')]
+        fleet_bags = [bag_of_row(row, '', f'row {number}')
+                      for number, row in enumerate(bags.to_dict('records'))]
     else:
         names = [bags] if isinstance(bags, (str, Path)) else bags
         fleet_bags = find_bags([str(name) for name in names], vehicle_from)
@@ -164,14 +165,6 @@ def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
             return _data_frame(client, jobs)
         with engine(None, None, MEMORY, 3) as local_client:
             return _data_frame(local_client, jobs)
-
-
-def _bag_of_row(row: Mapping[str, Any]) -> Any:
-    """Return the bag of a row of a DataFrame; missing values are NaN or None."""
-    from odocal_ros.fleet.bags import COLUMNS, FleetBag
-    known = {name: row[name] for name in COLUMNS if name in row and row[name] == row[name]
-             and row[name] is not None}
-    return FleetBag(**known | {'legs': tuple(str(known.get('legs', '')).split())})
 
 
 def _arguments(options: dict[str, Any]) -> Any:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -95,15 +95,15 @@ def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> style.Dra
     if not points:
         return None
     figure, (ax,) = style.new_figure_column(3.4)
-    others = np.array([(point.t, point.scale / current[point.vehicle]) for point in points
-                       if point.vehicle not in highlighted]).reshape(-1, 2)
+    others = np.concatenate([np.empty((0, 2)), *(
+        legs_of_vehicle[:, :2] / (1.0, current[vehicle])
+        for vehicle, legs_of_vehicle in points.items() if vehicle not in highlighted)])
     ax.plot(others[:, 0].astype('datetime64[s]'), (others[:, 1] - 1) * 100, '.', ms=2.5,
             color=style.GREY, label='others')
     styles = [(colour, mark) for mark in 'os'
               for colour in (style.BLUE, style.RED, style.GREEN, style.PINK)]
     for vehicle, (colour, mark) in zip(highlighted, styles, strict=False):
-        t, scale, sigma = np.array(sorted(point[1:] for point in points
-                                          if point.vehicle == vehicle)).T
+        t, scale, sigma = np.array(sorted(points[vehicle].tolist())).T
         ax.errorbar(t.astype('datetime64[s]'), (scale / current[vehicle] - 1) * 100,
                     sigma / current[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
                     label=vehicle[:18])
@@ -117,27 +117,26 @@ def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> style.Dra
                          'that changed or need inspection, the worst first.')
 
 
-class _LegPoint(NamedTuple):
-    """The scale of a leg."""
+def _read_points(path: Path, known: set[str], highlighted: set[str]) -> dict[str, np.ndarray]:
+    """
+    Return s since 1970, scale and its sigma of legs, (n, 3), by vehicle.
 
-    vehicle: str
-    t: float          # s since 1970
-    scale: float
-    sigma: float
-
-
-def _read_points(path: Path, known: set[str], highlighted: set[str]) -> list[_LegPoint]:
-    """Return the scales of the legs of known vehicles; of those not highlighted, every n-th."""
+    known : the vehicles to return; of those that are not highlighted, every n-th leg.
+    """
     import pyarrow.parquet as pq
     columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
     with pq.ParquetFile(path) as file:
         stride = max(1, file.metadata.num_rows // MAX_POINTS)
         rows = (row for batch in file.iter_batches(columns=columns, batch_size=10_000,
                                                    use_threads=False) for row in batch.to_pylist())
-        return [_LegPoint(row['vehicle'], row['start_ns'] / 1e9, row['scale_factor'],
-                          row['scale_factor_sigma'] or 0.0) for k, row in enumerate(rows, 1)
-                if row['scale_factor'] is not None and row['verdict'] != 'rejected'
-                and row['vehicle'] in known and (row['vehicle'] in highlighted or k % stride == 0)]
+        points: dict[str, list[tuple[float, float, float]]] = {}
+        for k, row in enumerate(rows, 1):
+            vehicle = row['vehicle']
+            if row['scale_factor'] is not None and row['verdict'] != 'rejected' \
+                    and vehicle in known and (vehicle in highlighted or k % stride == 0):
+                points.setdefault(vehicle, []).append((
+                    row['start_ns'] / 1e9, row['scale_factor'], row['scale_factor_sigma'] or 0.0))
+    return {vehicle: np.array(legs) for vehicle, legs in points.items()}
 
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:

@@ -101,11 +101,9 @@ class RowStore:
         self.folder = Path(folder)
 
     def path(self, key: str) -> Path:
-        """Return the file of a row."""
         return self.folder / 'rows' / key[:2] / f'{key}.parquet'
 
     def put(self, row: Row) -> None:
-        """Write a row."""
         import pyarrow as pa
         import pyarrow.parquet as pq
         path = self.path(row.key)

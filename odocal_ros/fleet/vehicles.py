@@ -171,14 +171,18 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
         calibration = replace(
             calibration, reasons=(rejected_state_reason(last_rejected), *calibration.reasons))
     since_ns = current_legs[0].leg.start_ns
+    outliers = sorted({k for values in histories.values() for k in values.outlier_legs})
     row |= _current_state(calibration, config, legs, since_ns) | _changes(histories, legs) | {
+        'odd_legs': ' '.join(str(k + 1) for k in outliers),
         'rejected_for': ' '.join(dict.fromkeys(
             reason.code.name for driven in legs for reason in rejecting_reasons(driven.leg))),
         'rejected_since': utc(last_rejected[0].leg.start_ns) if last_rejected else None,
         'current_bags': [bag_row.bag for bag_row in done
                          if bag_row.start_ns >= since_ns or bag_row is done[-1]],
         'report': None}
-    leg_rows = [_leg_row(row, k, driven, starts, histories) for k, driven in enumerate(legs)]
+    leg_rows = [leg_row(job.vehicle, row['model'], k + 1, driven.odometer_km, driven.leg) | {
+        'period': sum(start <= k for start in starts), 'odd': k in outliers}
+        for k, driven in enumerate(legs)]
     inputs = tuple({'bag': bag_row.bag, 'sha256': bag_row.sha256,
                     'topics': json.loads(bag_row.topics)} for bag_row in done)
     return Vehicle(row, leg_rows, calibration, config, inputs)
@@ -237,18 +241,8 @@ def _changes(histories: dict[str, ValueHistory], legs: Sequence[DrivenLeg]) -> d
                 'leg': values.legs[change.leg] + 1,
                 'size': math.expm1(change.size) if name == 'scale_factor' else change.size,
                 'sigma': change.sigma, 'unit': '1' if name == 'scale_factor' else 'rad'})
-    outliers = {k + 1 for values in histories.values() for k in values.outlier_legs}
     by_date, by_distance = histories['scale_factor'].by_date, histories['scale_factor'].by_distance
     return {'changes': json.dumps(sorted(changes, key=lambda change: change['by'])),
-            'odd_legs': ' '.join(map(str, sorted(outliers))),
             'drift_per_year': by_date.slope, 'drift_per_year_sigma': by_date.slope_sigma,
             'drift_per_1000_km': by_distance.slope,
             'drift_per_1000_km_sigma': by_distance.slope_sigma}
-
-
-def _leg_row(row: dict[str, Any], k: int, driven: DrivenLeg, starts: Sequence[int],
-             histories: dict[str, ValueHistory]) -> dict[str, Any]:
-    """Return the row of leg k, from 0; row : of the vehicle.   starts : legs after a change."""
-    return leg_row(row['vehicle'], row['model'], k + 1, driven.odometer_km, driven.leg) | {
-        'period': sum(start <= k for start in starts),
-        'odd': any(k in values.outlier_legs for values in histories.values())}

@@ -9,12 +9,11 @@ value agrees, 1 if one does not, 2 if the files cannot be read. A value agrees i
 truth's ``accept`` interval if it has one, else within four sigmas.
 """
 
-from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline.cli import print_text, warn
@@ -22,33 +21,30 @@ from odocal_ros.output.summary import DEG
 from odocal_ros.output.value_text import with_sigma
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A value and its truth, both in the printed unit."""
 
     name: str
     value: float | None
     sigma: float | None
     truth: float
-    truth_sigma: float = 0.0
-    accept: tuple[float, float] | None = None
+    truth_sigma: float      # 0: exact
+    accept: list[float]     # limits of the value; empty: four sigmas from the truth
 
     @property
-    def error_in_sigmas(self) -> float | None:
-        """Return the error divided by its sigma, None without value or sigma."""
+    def error_in_sigmas(self) -> float:
+        """Return the error divided by its sigma, nan without value or sigma."""
         if self.value is None or self.sigma is None:
-            return None
+            return math.nan
         return (self.value - self.truth) / max(math.hypot(self.sigma, self.truth_sigma), 1e-300)
 
     @property
     def agrees(self) -> bool:
-        """Return True if the value agrees with the truth; a missing value is not an error."""
-        if self.value is None:
-            return True
-        if self.accept is not None:
-            return self.accept[0] <= self.value <= self.accept[1]
+        """Return True if the value agrees with the truth, or is not determined."""
         limit = 4.0    # sigmas: exceeded by chance in one of 16 000
-        return self.error_in_sigmas is not None and abs(self.error_in_sigmas) <= limit
+        return self.value is None or (
+            self.accept[0] <= self.value <= self.accept[1] if self.accept
+            else abs(self.error_in_sigmas) <= limit)
 
 
 def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[Row]:
@@ -59,38 +55,32 @@ def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[
     simulate (``scale`` is the factor) or of a real drive (``scale`` is the ratio to nominal).
     """
     scale = 'scale_factor' if 'ratio' in truth.get('scale', ()) else 'scale_ratio'
-    return [_row(name, calibration['result'], truth[key], factor) for name, key, factor in (
-        (scale, 'scale', 1.0), ('yaw_mounting_angle', 'yaw_mounting_deg', DEG),
-        ('pitch_mounting_angle', 'pitch_mounting_deg', DEG)) if key in truth]
-
-
-def _row(name: str, result: dict[str, dict[str, Any]], truth: dict[str, Any],
-         factor: float) -> Row:
-    entry = result[name]
-    value, sigma = (None if entry[key] is None else entry[key] * factor
-                    for key in ('value', 'sigma'))
-    unit = 'deg' if factor != 1.0 else entry['unit'] or ''
-    accept = truth.get('accept')
-    return Row(f'{name.replace("_", " ")}{f", {unit}" if unit not in ("", "1") else ""}', value,
-               sigma, float(truth['value']), float(truth.get('sigma', 0.0)),
-               None if accept is None else (float(accept[0]), float(accept[1])))
+    compared = []
+    for name, key in ((scale, 'scale'), ('yaw_mounting_angle', 'yaw_mounting_deg'),
+                      ('pitch_mounting_angle', 'pitch_mounting_deg')):
+        if key in truth:
+            factor = DEG if key.endswith('_deg') else 1.0
+            entry, true = calibration['result'][name], truth[key]
+            value, sigma = (None if entry[part] is None else entry[part] * factor
+                            for part in ('value', 'sigma'))
+            unit = 'deg' if key.endswith('_deg') else entry['unit']
+            label = name.replace('_', ' ') + f', {unit}' * (unit not in (None, '1'))
+            compared.append(Row(label, value, sigma, float(true['value']),
+                                float(true.get('sigma', 0.0)),
+                                list(map(float, true.get('accept') or ()))))
+    return compared
 
 
 def table(compared: list[Row]) -> str:
     """Return values, truth and errors in sigmas as text."""
-    lines = [f'{"":<28}{"found":<32}{"truth":<20}off by']
+    lines = [f'{"":<28}{"result":<32}{"truth":<20}error']
     for row in compared:
-        if row.value is None:
-            lines.append(f'{row.name:<28}{"not determined":<32}{_truth(row)}')
-            continue
-        error_text = '' if row.error_in_sigmas is None else f'{row.error_in_sigmas:+z.1f} sigma'
-        lines.append(f'{row.name:<28}{with_sigma(row.value, row.sigma):<32}{_truth(row):<20}'
-                     f'{error_text:<14}{"" if row.agrees else "DOES NOT AGREE"}'.rstrip())
+        truth = with_sigma(row.truth, row.truth_sigma) if row.truth_sigma else f'{row.truth:.8g}'
+        value = with_sigma(row.value, row.sigma) if row.value is not None else 'not determined'
+        error = '' if math.isnan(row.error_in_sigmas) else f'{row.error_in_sigmas:+z.1f} sigma'
+        lines.append(f'{row.name:<28}{value:<32}{truth:<20}{error:<14}'
+                     f'{"" if row.agrees else "DOES NOT AGREE"}'.rstrip())
     return '\n'.join(lines)
-
-
-def _truth(row: Row) -> str:
-    return with_sigma(row.truth, row.truth_sigma) if row.truth_sigma else f'{row.truth:.8g}'
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -10,6 +10,8 @@ command as an extension of ros2cli, ``ros2 odocal``.
 """
 
 import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 import importlib
 import json
@@ -40,7 +42,7 @@ COMMANDS = {      # name: (its module, or the package that has it as an entry po
     'patent': ('odocal_reproductions', 'compute the example of patent CN104359492A'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130    # definition: exit codes
-# formats of tqdm for a phase: fraction done known, or not
+# formats of tqdm for a phase with and without a known fraction
 BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
 CLOCK = '{desc:<26} {elapsed}'
 
@@ -185,48 +187,39 @@ def warn(text: str) -> None:
     print(brief_line(text), file=sys.stderr)
 
 
-class Phase:
+@contextmanager
+def show_phase(title: str, quiet: bool = False) -> Iterator[Callable[..., None]]:
     """
-    A phase of the work, as a context; called with the fraction done, if known.
+    Show title and clock of a phase of the work, on a terminal only; yield ``set_progress``.
 
-    title : of the work.   quiet : show nothing, as without a terminal on stderr.
+    set_progress(fraction, title) : fraction done, None if unknown, and a new title, if any.
     """
-
-    def __init__(self, title: str, quiet: bool = False) -> None:
-        self._title = title
-        self._shown = not quiet and sys.stderr is not None and sys.stderr.isatty()
-        self._over = threading.Event()
-
-    def __enter__(self) -> 'Phase':
-        if self._shown:
-            from tqdm import tqdm
-            columns, rows = get_terminal_size()     # 80, 24 if the terminal gives none
-            self._bar = tqdm(total=1.0, desc=self._title, leave=False, file=sys.stderr,
-                             bar_format=CLOCK, mininterval=0.0,
-                             ncols=columns, nrows=rows)
-            self._ticker = threading.Thread(target=self._tick, daemon=True)
-            self._ticker.start()
-        return self
-
-    def __call__(self, share: float | None, title: str = '') -> None:
-        """Set the fraction done, None if unknown, and the new title if there is one."""
-        if self._shown:
-            self._bar.bar_format = CLOCK if share is None else BAR
+    if quiet or sys.stderr is None or not sys.stderr.isatty():
+        yield lambda fraction, title='': None
+        return
+    from tqdm import tqdm
+    columns, rows = get_terminal_size()     # 80, 24 if the terminal gives none
+    with tqdm(total=1.0, desc=title, leave=False, file=sys.stderr, bar_format=CLOCK,
+              mininterval=0.0, ncols=columns, nrows=rows) as bar:
+        def set_progress(fraction: float | None, title: str = '') -> None:
+            bar.bar_format = CLOCK if fraction is None else BAR
             if title:
-                self._bar.set_description_str(title, refresh=False)
-            self._bar.n = min(max(share or 0.0, 0.0), 1.0)
-            self._bar.refresh()
+                bar.set_description_str(title, refresh=False)
+            bar.n = min(max(fraction or 0.0, 0.0), 1.0)
+            bar.refresh()
 
-    def __exit__(self, *_: object) -> None:
-        if self._shown:
-            self._over.set()
-            self._ticker.join()
-            self._bar.close()
+        def tick() -> None:
+            tick_s = 0.5    # the clock runs without reports
+            while not is_over.wait(tick_s):
+                bar.refresh()
 
-    def _tick(self) -> None:
-        tick_s = 0.5    # the clock of a phase runs without reports
-        while not self._over.wait(tick_s):
-            self._bar.refresh()
+        is_over, ticker = threading.Event(), threading.Thread(target=tick, daemon=True)
+        ticker.start()
+        try:
+            yield set_progress
+        finally:
+            is_over.set()
+            ticker.join()
 
 
 if __name__ == '__main__':

@@ -37,15 +37,16 @@ def run(args: argparse.Namespace) -> int:
 
 def _screen(comparison: 'Comparison') -> list[str]:
     from odocal_ros.library.compare import label_of, shared_error_notes
-    from odocal_ros.output.stored import estimate_text as value_text
+    from odocal_ros.output.stored import estimate_text
     from odocal_ros.output.value_text import counted, table_lines
     stored = comparison.stored
     width = max(len(calibration.name) for calibration in stored)
-    lines = [f'{number:>3}  {one.name:<{width}}  {one.created}  {one.verdict.value}, '
-             f'{counted(len(one.legs), "leg")}' for number, one in enumerate(stored, 1)]
+    lines = [f'{number:>3}  {calibration.name:<{width}}  {calibration.created}  '
+             f'{calibration.verdict.value}, {counted(len(calibration.legs), "leg")}'
+             for number, calibration in enumerate(stored, 1)]
     for change in comparison.changes:
         rows: list[tuple[str, ...]] = [
-            (f'{entry.index + 1:>2}', value_text(entry.estimate),
+            (f'{entry.index + 1:>2}', estimate_text(entry.estimate),
              _cell(change, entry.to_first, stored), _cell(change, entry.to_previous, stored))
             for entry in change.entries]
         rows.insert(0, ('', 'value', 'since the first', 'since the previous'))

@@ -17,9 +17,10 @@ from odocal_ros import __version__
 from odocal_ros.offline.cli import print_text
 
 NEEDED = ('numpy', 'scipy', 'pyproj', 'PyYAML', 'matplotlib', 'jinja2', 'tqdm')
+# package: what does not work without it
 OPTIONAL = {'rosbags': 'rosbag1 files, message types of a bag, written bags',
             'rich': 'odocal watch', 'pandas': 'to_frame', 'pyarrow': 'Parquet'}
-# the only environment variables shown
+# no other environment variable is printed: it may be secret
 SHOWN_VARIABLES = ('ROS_DISTRO', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE',
                    'ROS_LOCALHOST_ONLY', 'ROS_HOME', 'ODOCAL_LIMITS')
 MISSING = 'MISSING'
@@ -47,16 +48,16 @@ def run(args: argparse.Namespace) -> int:
     width = max(len(name) for name, _ in rows)
     print_text('\n'.join(f'{name:<{width}}  {text}' for name, text in rows))
     missing = [name for name, text in rows if text == MISSING]
-    print_text(f'missing: {", ".join(missing)}; reinstall with pip or rosdep' if missing
+    print_text(f'missing: {", ".join(missing)}; reinstall odocal_ros (docs/install.md)' if missing
                else 'all required packages found')
     return 1 if missing else 0
 
 
-def _version(name: str, absent: str = MISSING) -> str:
+def _version(name: str, missing_text: str = MISSING) -> str:
     try:
         return version(name)
     except PackageNotFoundError:
-        return absent
+        return missing_text
 
 
 def _ros() -> list[tuple[str, str]]:

@@ -26,19 +26,15 @@ from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.transforms import add_static_readers, STATIC
 from odocal_ros.offline import odometer_search, survey, wheel_survey
 from odocal_ros.offline.inspection_drive import DriveInspection, inspect_drive
-from odocal_ros.offline.missing_inputs import missing_input_reasons
+from odocal_ros.offline.missing_inputs import finding_facts, missing_input_reasons
 from odocal_ros.offline.suggest import likely_mapping, replay_command, replay_refusal
 from odocal_ros.offline.survey import fix_path, FixPath, Match
 from odocal_ros.output.files import plain
 from odocal_ros.output.value_text import counted
-from odocal_ros.reasons import Code, Reason
+from odocal_ros.reasons import Reason
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config, SIDES, with_settings
 from odocal_ros.settings.config_file import parse_set
-
-# reasons that affect the two-point method only: its initial alignment and its end points
-TWO_POINT_CODES = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARABLE,
-                   Code.LEG_NOT_STRAIGHT}
 
 
 class _TopicSamples:
@@ -103,7 +99,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     findings = [*(note for note in bag.notes if isinstance(note, Reason)), *drive.findings,
                 *missing_input_reasons(content, mapping, config)]
     return dict(plain(content | {
-        'findings': _finding_facts(findings, config, options),
+        'findings': finding_facts(findings, config, options),
         'replay_error': replay_refusal(bag.topics, initial_config, overrides),
         'command': replay_command(path, bag.topics, initial_config, overrides, mapping,
                                   options)}))
@@ -159,17 +155,6 @@ def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
         'start_utc': datetime.fromtimestamp(bag.start_ns // 10**9, UTC).isoformat(),
         'messages': sum(info.count for info in bag.topics.values()),
         'notes': [note for note in bag.notes if isinstance(note, str)]}
-
-
-def _finding_facts(findings: list[Reason], config: Config,
-                   options: list[str]) -> list[dict[str, Any]]:
-    """Return findings as dicts; ``method``: the only one that a finding affects, None: all."""
-    has_wheels = config.odometer.wheel_keys or any(
-        option.startswith(('odometer.left=', 'odometer.wheels=')) for option in options)
-    codes = TWO_POINT_CODES - {Code.NO_STANDSTILL} if has_wheels else TWO_POINT_CODES
-    return [reason.as_dict() | {'method': 'two_point' if (
-        config.method != 'two_point' and reason.code in codes) else None}
-        for reason in dict.fromkeys(findings)]
 
 
 def _make_samples(bag: Bag, config: Config,
@@ -270,8 +255,7 @@ def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str
     topic = mapping.get('odometer', '')
     odometer = samples_by_topic.get(topic)
     options: list[str] = []
-    if odometer and topic in motions and not (
-            config.odometer.wheel_keys or config.odometer.field):
+    if odometer and topic in motions and not (config.odometer.wheel_keys or config.odometer.field):
         values, wheels, form = motions[topic], odometer.reader.wheels, odometer.reader.form
         named = wheels if form and form.sides_known else ()
         rolling = {value['key'] for value in values if value['rolls']}

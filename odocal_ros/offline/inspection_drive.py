@@ -77,7 +77,10 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config) -> DriveInspe
         result.findings += [reason for reason in missing_data_reasons(leg, inputs)
                             if reason.code not in codes]
         return result
-    result.findings += _imu_unit_reasons(inputs, config)
+    result.findings += with_mounting_remedy(
+        gravity_turn_reasons(inputs) or imu_orientation.unit_and_axis_reasons(
+            inputs.median_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
+        or unit_change_reasons(inputs), inputs)
     result.options, w_i, f_i = _unit_options(inputs, config)
     located = locate_fixes(inputs, config)
     still_reasons = [reason for reason in motion_reasons(
@@ -132,14 +135,6 @@ def _travel_between_fixes(inputs: Inputs) -> float:
         inside = (t > ends[0]) & (t < ends[1])
         s = np.concatenate([inputs.travel.at(ends[:1]), s[inside], inputs.travel.at(ends[1:])])
     return float(np.abs(np.diff(s)).sum())
-
-
-def _imu_unit_reasons(inputs: Inputs, config: Config) -> list[Reason]:
-    """Return the reasons on units and axes of the IMU."""
-    return list(with_mounting_remedy(
-        gravity_turn_reasons(inputs) or imu_orientation.unit_and_axis_reasons(
-            inputs.median_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
-        or unit_change_reasons(inputs), inputs))
 
 
 def _unit_options(inputs: Inputs, config: Config) -> tuple[list[str], Floats, Floats]:

@@ -86,7 +86,7 @@ class FieldCollector:
 
     def _find_fields(self, message: object) -> None:
         """Find the numeric fields of the first message; raise BadData if there are none."""
-        numbers = list(islice(_numbers(message, ''), MAX_FIELDS))
+        numbers = list(islice(_numbers(message), MAX_FIELDS))
         if not numbers:
             raise BadData('no numeric field')
         self.paths = [path for path, _ in numbers]
@@ -143,24 +143,16 @@ def _sort_key(field: dict[str, Any]) -> tuple[bool, float]:
     return field['quantity'] != 'cumulative', -round(field['explained'], 3)
 
 
-def _numbers(message: object, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Yield path and value of each number of a message."""
-    for name in getattr(type(message), '__dataclass_fields__', ()):
-        if not name.startswith('__') and name not in NOT_SEARCHED:
-            yield from _numbers_of(getattr(message, name), prefix + name)
-
-
-def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield path and value of a number, of each number of an array, or of a nested message."""
-    if isinstance(value, (bool, str, bytes)):
-        return
-    if isinstance(value, (int, float, np.number)):
-        yield path, value
-    elif isinstance(value, (list, np.ndarray)):
+def _numbers(value: object, path: str = '') -> Iterator[tuple[str, Any]]:
+    """Yield path and value of a number, or of each number of an array or a message."""
+    if isinstance(value, (list, np.ndarray)):
         for k, element in enumerate(value[:MAX_ELEMENTS]):
-            yield from _numbers_of(element, f'{path}[{k}]')
-    else:
-        yield from _numbers(value, f'{path}.')
+            yield from _numbers(element, f'{path}[{k}]')
+    elif isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
+        yield path, value
+    for name in getattr(type(value), '__dataclass_fields__', ()):
+        if not name.startswith('__') and name not in NOT_SEARCHED:
+            yield from _numbers(getattr(value, name), f'{path}.{name}'.removeprefix('.'))
 
 
 def _best_meaning(path: str, is_integer: bool, t_ns: Ints, value: Floats, fixes: FixPath,

@@ -38,10 +38,9 @@ def indoor_screen(runs: list[PlannedRun]) -> str:
         sigmas = [run.sigma(quantity) for quantity in (names[0], 'ratio', *names[1:])]
         lines.append(texts.table_row((name, *(_indoor_sigma(sigma, head) for sigma, head in zip(
             sigmas, heads, strict=True))), widths))
-    missing = {reason.text: reason for run in runs for reason in run.method.reasons if len(
-        runs) == 1 and reason.code.name.endswith(('_NOT_DETERMINED', '_SEPARABLE'))}
-    for reason in missing.values():
-        lines += ['', *texts.wrapped(f'{reason}. {reason.remedy}')]
+    for reason in dict.fromkeys(runs[0].method.reasons if len(runs) == 1 else ()):
+        if reason.code.name.endswith(('_NOT_DETERMINED', '_SEPARABLE')):
+            lines += ['', *texts.wrapped(f'{reason}. {reason.remedy}')]
     return '\n'.join(lines)
 
 
@@ -54,20 +53,19 @@ def _indoor_sigma(sigma: float | None, head: str) -> str:
 def _drive_lines(plan: Planned) -> list[str]:
     sigmas, two_point = plan.sigmas, plan.two_point
     alignment, tau = two_point.alignment, sigmas.correlation_time
-    rests = [f'standing {texts.duration_text(rest)}' if rest else 'in motion'
-             for rest in two_point.rests]
+    at_start, at_end = (f'standing {texts.duration_text(rest)}' if rest else 'in motion'
+                        for rest in two_point.rests)
     noise = f'correlation time {tau:g} s' if tau else 'white'
     lines = [f'{texts.length_text(two_point.distance)} in '
-             f'{texts.duration_text(two_point.duration)}, {rests[0]} at the start mark, '
-             f'{rests[1]} at the end mark; '
-             f'marks {texts.length_text(two_point.chord)} apart',
+             f'{texts.duration_text(two_point.duration)}, {at_start} at the start mark, {at_end} '
+             f'at the end mark; marks {texts.length_text(two_point.chord)} apart',
              f'IMU grade {sigmas.config.imu.grade}, heading from {alignment.heading_source} '
-             f'(sigma {math.degrees(alignment.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m '
-             f'at {sigmas.fix_rate:.3g} Hz, {noise}']
+             f'(sigma {math.degrees(alignment.heading_sigma):.3g} deg), fix sigma '
+             f'{sigmas.fix:.3g} m at {sigmas.fix_rate:.3g} Hz, {noise}']
     if 'smoother' in plan.methods:
         slip = 1000 * sigmas.slip
         is_estimated = alignment.heading_source in ('course', 'gyrocompass')
-        no_heading_text = ' needs no heading;' * is_estimated
+        no_heading_text = ' estimates the heading;' * is_estimated
         white = f'; white part of the fix errors {100 * WHITE_SIGMA_SHARE:.0f} %' if tau else ''
         lines.append(f'smoother:{no_heading_text} wheel slip {slip:.2g} mm/√s, sway '
                      f'{sigmas.sway:.2g} m/s (white at {SWAY_RATE:g} Hz){white}')
@@ -79,7 +77,8 @@ def _sigma_lines(plan: Plan) -> list[str]:
         (name, *(_sigma_text(parameter, method.estimates[parameter].sigma)
                  for parameter in texts.MAIN_VALUES))
         for name, method in plan.methods.items())]
-    return [*(texts.table_row(row, (20, 14, 16, 16)) for row in rows),
+    widths = 20, 14, 16, 16
+    return [*(texts.table_row(row, widths) for row in rows),
             f'  (result: {_method_text(plan)})']
 
 
@@ -100,7 +99,7 @@ def _sigma_text(parameter: str, sigma: float | None) -> str:
 
 
 def _budget_lines(plan: Plan) -> list[str]:
-    """Return the main error sources of each method that will provide a value."""
+    """Return the main error sources of each method that gives a value of the result."""
     budgets = []
     min_share = 0.01    # share of the variance from which a source has its row
     for name in plan.methods_used:
@@ -117,9 +116,9 @@ def _budget_lines(plan: Plan) -> list[str]:
 def _improvement_lines(plan: Planned) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
-        best, word = ranked(plan.improvements, plan, parameter), texts.MAIN_VALUES[parameter]
-        lines.append(f'  largest improvements of the {word}' if best else
-                     f'  no tested change improves the {word}')
+        best, label = ranked(plan.improvements, plan, parameter), texts.MAIN_VALUES[parameter]
+        lines.append(f'  largest improvements of the {label}' if best else
+                     f'  no tested change improves the {label}')
         lines += [f'    {change.text:<58}{_sigma_text(parameter, plan.sigma(parameter)):>10} -> '
                   f'{_sigma_text(parameter, change.sigmas[parameter])}' for change in best[:4]]
     return lines

@@ -4,6 +4,7 @@
 """odocal replay: calibrate from recorded bags as the node does; options shared by commands."""
 
 import argparse
+from contextlib import AbstractContextManager
 import os
 from pathlib import Path
 from shutil import get_terminal_size
@@ -13,8 +14,8 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.arguments import legs_of, Listener
-from odocal_ros.offline.cli import Phase, print_json, print_text, warn
+from odocal_ros.library.arguments import legs_of, Listener, Progress
+from odocal_ros.offline.cli import print_json, print_text, show_phase, warn
 from odocal_ros.safe_io.text_formats import one_line
 
 if TYPE_CHECKING:
@@ -119,8 +120,8 @@ class _TerminalListener(Listener):
         if self._prints_notes:
             warn(f'odocal: {text}')
 
-    def phase(self, title: str) -> Phase:
-        return Phase(title, quiet=not self._shows_phases)
+    def phase(self, title: str) -> AbstractContextManager[Progress]:
+        return show_phase(title, quiet=not self._shows_phases)
 
 
 def config_from_arguments(args: argparse.Namespace) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.cli import Phase, print_text
+from odocal_ros.offline.cli import print_text, show_phase
 from odocal_ros.safe_io.text_formats import for_shell
 from odocal_ros.settings.levels import DAY_NS
 
@@ -155,10 +155,10 @@ def _span(text: str) -> tuple[float, float]:
 def options_of(args: argparse.Namespace) -> 'SimOptions':
     """Return the drive's options: the arguments with the name of a field of SimOptions."""
     from odocal_ros.sim.options import SimOptions
-    given = {field.name: getattr(args, field.name, None) for field in fields(SimOptions)}
     options: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in given.items() if value is not None}
+        field.name: tuple(value) if isinstance(value, list) else value
+        for field in fields(SimOptions)
+        if (value := getattr(args, field.name, None)) is not None}
     # each seed has its own date, so that drives do not overlap in time
     seed = options.get('seed', SimOptions.seed)
     days = 3650    # then the days of the seeds repeat
@@ -167,7 +167,7 @@ def options_of(args: argparse.Namespace) -> 'SimOptions':
 
 
 def _with_random_vehicle(args: argparse.Namespace, options: dict[str, Any]) -> 'SimOptions':
-    """Return SimOptions of the options, a random vehicle if requested, and sensor parameters."""
+    """Return the drive's options with --vehicle, --effect and --real."""
     from odocal_ros.sim.draw import draw_vehicle
     from odocal_ros.sim.options import DEFAULTS, SimOptions
     from odocal_ros.sim.real_effects import parse_parameter, RealEffects
@@ -187,7 +187,7 @@ def _with_random_vehicle(args: argparse.Namespace, options: dict[str, Any]) -> '
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate; write a bag with its two files, or those of a fleet; return 0."""
+    """Write a simulated bag, its truth and its settings, or those of a fleet; return 0."""
     if args.fleet is not None:
         return _run_fleet(args)
     heading_sigma_deg = args.known_heading_sigma_deg
@@ -198,7 +198,7 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.sim.truth import topic_arguments
     out = Path(args.out)
     truth, settings = truth_paths(out)
-    with Phase('writing', args.quiet) as progress:
+    with show_phase('writing', args.quiet) as progress:
         drive = simulate(options_of(args), out, storage=args.storage,
                          compression=args.compression, force=args.force,
                          heading_sigma=None if heading_sigma_deg is None
@@ -206,20 +206,19 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         replay = ['odocal', 'replay', str(out), '--config', str(settings), *topic_arguments(drive)]
         print_text(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
-                   f'{sum(len(t.time_ns) for t in drive_topics(drive))} messages; '
-                   f'truth in {truth}; next: {for_shell(replay)}')
+                   f'{sum(len(topic.time_ns) for topic in drive_topics(drive))} messages; '
+                   f'truth in {truth}; to calibrate from it: {for_shell(replay)}')
     return 0
 
 
 def _run_fleet(args: argparse.Namespace) -> int:
-    """Write the bags of a fleet; return 0."""
     from odocal_ros.library.simulate import simulate_fleet
     out = Path(args.out)
-    with Phase('simulating', args.quiet) as progress:
+    with show_phase('simulating', args.quiet) as progress:
         manifest = simulate_fleet(
             out, options_of(args), args.fleet, args.bags, storage=args.storage,
             compression=args.compression, force=args.force, progress=progress)
     if not args.quiet:
         print_text(f'{out}: {args.fleet} vehicles, {args.fleet * args.bags} bags; truth in '
-                   f'{out}/truth.yaml; next: odocal fleet {manifest} --output result')
+                   f'{out}/truth.yaml; to calibrate: odocal fleet {manifest} --output result')
     return 0

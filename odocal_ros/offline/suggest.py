@@ -41,10 +41,10 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     return mapping, config
 
 
-def _left_right_pair(topics: dict[str, TopicInfo], unused: list[str]) -> tuple[str, str] | None:
-    """Return the topics of the left and the right wheel if two differ in this word only."""
-    pairs = [(left, right) for left in unused if 'left' in left
-             and (right := left.replace('left', 'right')) in unused
+def _left_right_pair(topics: dict[str, TopicInfo], names: list[str]) -> tuple[str, str] | None:
+    """Return the only topics of a left and a right wheel, whose names differ in this word only."""
+    pairs = [(left, right) for left in names if 'left' in left
+             and (right := left.replace('left', 'right')) in names
              and topics[left].msgtype == topics[right].msgtype]
     return pairs[0] if len(pairs) == 1 else None
 
@@ -72,19 +72,16 @@ def _sorted_topics(topics: dict[str, TopicInfo], slot: str, names: Iterable[str]
 
 
 def other_candidates(topics: dict[str, TopicInfo], slot: str, config: Config,
-                     mapping: dict[str, str], not_following: Collection[str]) -> list[str]:
-    """Return the other candidates for a slot, the most likely first."""
+                     mapping: dict[str, str],
+                     not_following: Collection[str]) -> tuple[list[str], str]:
+    """Return the other candidates for a slot, the most likely first, and why it has its topic."""
     used_topics = {other: topic for other, topic in mapping.items() if other != slot}
-    others = set(candidates(topics, slot, config, used_topics)) - {mapping[slot]}
-    return _sorted_topics(topics, slot, others, not_following)
-
-
-def reason_for_choice(topics: dict[str, TopicInfo], slot: str, topic: str, other: str,
-                      not_following: Collection[str]) -> str:
-    """Return the reason for suggesting ``topic`` for a slot instead of ``other``."""
-    own_keys, other_keys = (_sort_keys(slot, topics[name], not_following)
-                            for name in (topic, other))
-    return next(reason for reason, key in own_keys.items() if key != other_keys[reason])
+    others = _sorted_topics(topics, slot, set(candidates(topics, slot, config, used_topics)) - {
+        mapping[slot]}, not_following)
+    keys, *other_keys = (_sort_keys(slot, topics[name], not_following)
+                         for name in (mapping[slot], *others[:1]))
+    return others, next((reason for reason, key in keys.items()
+                         if other_keys and key != other_keys[0][reason]), '')
 
 
 def replay_refusal(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
@@ -98,7 +95,11 @@ def replay_refusal(topics: dict[str, TopicInfo], config: Config, overrides: dict
 
 def replay_command(path: str, topics: dict[str, TopicInfo], config: Config,
                    overrides: dict[str, str], mapping: dict[str, str], extra: list[str]) -> str:
-    """Return the suggested replay command; '' if an input is missing."""
+    """
+    Return the suggested replay command; '' if an input is missing.
+
+    extra : settings, KEY=VALUE, and options, --OPTION VALUE.
+    """
     needed = {'odometer', 'fix'} | ({'imu'} if config.odometer.needs_imu else set())
     if not needed <= mapping.keys():
         return ''

@@ -4,12 +4,13 @@
 """
 odocal try: calibrate a bag with one command, without knowledge of its topics.
 
-It inspects the bag, prints the selected topics and settings with reasons, replays with them, and
-opens the report in a browser.
+It inspects the bag, prints the selected topics and settings with reasons, runs odocal replay with
+them, and opens the report in a browser.
 """
 
 import argparse
 from collections.abc import Collection
+from itertools import chain
 import os
 from pathlib import Path
 import shlex
@@ -20,6 +21,7 @@ from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadData
 from odocal_ros.offline import replay
 from odocal_ros.offline.cli import print_text
+from odocal_ros.safe_io.text_formats import for_shell
 
 if TYPE_CHECKING:
     from odocal_ros.bagio.read import Bag
@@ -31,24 +33,10 @@ SETTING_REASONS = {      # why the inspection suggests a setting; imu.mounting_r
     'gnss.max_sigma': 'the stated sigma of most fixes exceeds the limit',
     'odometer.field': 'this value grows with the distance between the fixes',
     'odometer.quantity': 'with this meaning the value grows with the distance between the fixes',
-    'odometer.wrap': 'the counter restarts at this value',
+    'odometer.wrap': 'the counter restarts from 0 at this value',
     'odometer.reversed': 'the counts decrease on most of the drive'}
 BY_TOPIC_NAME = 'the names of two topics only differ in left and right'
 BY_MOTION = 'it moves as a wheel; its side is known from its name or from the gyro'
-# what to do if a slot has no topic
-MISSING = {'imu': 'record sensor_msgs/Imu', 'odometer': 'select an odometer of another type with '
-           f'{topic_option("odometer")} TOPIC', 'fix': 'convert positions of another type to '
-           'sensor_msgs/NavSatFix'}
-
-
-def _missing_action(slot: str, topics: Collection[dict[str, Any]]) -> str:
-    """Return the action for a slot without a topic; topics : name, type and count of each."""
-    from odocal_ros.library.topics import NO_MESSAGES_REMEDY, topics_without_messages
-    empty = topics_without_messages(
-        {topic['name']: (topic['type'], topic['count']) for topic in topics}, slot)
-    if not empty:
-        return MISSING[slot]
-    return f'{", ".join(empty)} has no messages. {NO_MESSAGES_REMEDY.rstrip(".")}'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,23 +55,24 @@ def run(args: argparse.Namespace) -> int:
     content, choices = _inspect_with_choices(args)
     if not content['command']:
         from odocal_ros.offline.inspection_text import text
-        missing = [slot for slot in ('imu', 'odometer', 'fix') if slot not in content['mapping']]
-        # the error below states the missing topics
-        codes = {f'NO_{slot.upper()}' for slot in missing}
+        # the error states the missing topics
+        codes = {f'NO_{slot.upper()}' for slot in ('imu', 'odometer', 'fix')
+                 if slot not in content['mapping']}
         print_text(text(content | {'replay_error': '', 'findings': [
             finding for finding in content['findings'] if finding['code'] not in codes]}))
-        labels = ', '.join(INPUTS[slot].label for slot in missing)
-        raise BadData(f'{args.bag}: no usable topic for: {labels}; '
-                      + '; '.join(_missing_action(slot, content['topics']) for slot in missing))
+        raise BadData(f'{args.bag}: ' + ' '.join(
+            f'{finding["text"]}. {finding["remedy"]}' for finding in content['findings']
+            if finding['code'] in codes))
     options = [*_suggested_options(content['command'], args), *_user_options(args)]
     print_text('\n'.join(_overview(content, choices, options, args.settings)))
+    words = [args.bag, *chain.from_iterable(options), *['--strict'] * args.strict]
     parser = argparse.ArgumentParser()
     replay.add_arguments(parser)
     parser.set_defaults(brief=True)
-    code = replay.run(parser.parse_args([args.bag, *options] + ['--force'] * args.force))
+    code = replay.run(parser.parse_args(words + ['--force'] * args.force))
     _open_report(output / 'report.html', args.no_browser)
-    from odocal_ros.safe_io.text_formats import for_shell
-    print_text(f'\nnext time:\n  {for_shell(["odocal", "replay", args.bag, *options, "--force"])}')
+    print_text('\nto repeat this calibration:\n'
+               f'  {for_shell(["odocal", "replay", *words, "--force"])}')
     return code
 
 
@@ -117,28 +106,26 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
              content: dict[str, Any]) -> list[_Choice]:
     """Return the most likely topic of each slot with several candidates."""
     from odocal_ros.library.topics import candidates
-    from odocal_ros.offline.suggest import likely_mapping, other_candidates, reason_for_choice
+    from odocal_ros.offline.suggest import likely_mapping, other_candidates
     mapping, not_following = content['mapping'], content['not_following']
     _, config = likely_mapping(bag.topics, config, topics, not_following)
     choices = []
     for slot in mapping.keys() - topics.keys():
-        remaining = other_candidates(bag.topics, slot, config, mapping, not_following)
-        if remaining and mapping[slot] in candidates(bag.topics, slot, config, {}):
-            reason = reason_for_choice(bag.topics, slot, mapping[slot], remaining[0],
-                                       not_following)
-            choices.append(_Choice(slot, mapping[slot], remaining, reason))
+        others, reason = other_candidates(bag.topics, slot, config, mapping, not_following)
+        if others and mapping[slot] in candidates(bag.topics, slot, config, {}):
+            choices.append(_Choice(slot, mapping[slot], others, reason))
     return sorted(choices, key=lambda choice: list(INPUTS).index(choice.slot))
 
 
 def _choice_of_user(bag: 'Bag', choice: _Choice) -> _Choice:
-    """Ask the user at the terminal; an empty line selects the first topic."""
+    """Return the topic that the user selects at the terminal; an empty line: the first one."""
     names = [choice.topic, *choice.other_candidates]
     print_text(f'{len(names)} candidate topics for the {INPUTS[choice.slot].label}:')
     for number, name in enumerate(names, 1):
         info = bag.topics[name]
         print_text(f'  {number}  {name}  {info.msgtype}, {info.count} messages')
     while True:
-        print_text(f'which one? [1: {choice.reason}] ', end='')
+        print_text(f'number of the topic? [1: {choice.reason}] ', end='')
         sys.stdout.flush()
         line = sys.stdin.readline()
         if not line:
@@ -152,28 +139,24 @@ def _choice_of_user(bag: 'Bag', choice: _Choice) -> _Choice:
         print_text(f'enter a number from 1 to {len(names)}')
 
 
-def _suggested_options(replay_command: str, args: argparse.Namespace) -> list[str]:
-    """Return the options that inspect suggests and the user has not given, with their values."""
-    words = shlex.split(replay_command)[3:]
-    given = {text.partition('=')[0] for text in args.settings}
-    return [word for option, value in zip(words[::2], words[1::2], strict=True)
+def _suggested_options(replay_command: str, args: argparse.Namespace) -> list[tuple[str, str]]:
+    """Return (option, value) of the suggested command, without those that the user has set."""
+    words = shlex.split(replay_command)[3:]      # after odocal replay BAG
+    user_settings = {text.partition('=')[0] for text in args.settings}
+    return [(option, value) for option, value in zip(words[::2], words[1::2], strict=True)
             if not (option == '--leg' and args.leg)
-            and not (option == '--set' and value.partition('=')[0] in given)
-            for word in (option, value)]
+            and not (option == '--set' and value.partition('=')[0] in user_settings)]
 
 
-def _user_options(args: argparse.Namespace) -> list[str]:
-    """Return the options of the user that the suggested command does not contain."""
-    words = []
-    for option, given in (('--config', [args.config]), ('--set', args.settings),
-                          ('--leg', args.leg), ('--method', [args.method]),
-                          ('--accept', args.accept), ('--output', [args.output])):
-        for value in given:
-            words += [option, value] if value else []
-    return words + ['--strict'] * args.strict
+def _user_options(args: argparse.Namespace) -> list[tuple[str, str]]:
+    """Return (option, value) of the user, except topics: the suggested command has them."""
+    return [(option, value) for option, values in (
+        ('--config', [args.config]), ('--set', args.settings), ('--leg', args.leg),
+        ('--method', [args.method]), ('--accept', args.accept), ('--output', [args.output]))
+            for value in values if value]
 
 
-def _overview(content: dict[str, Any], choices: list[_Choice], options: list[str],
+def _overview(content: dict[str, Any], choices: list[_Choice], options: list[tuple[str, str]],
               user_settings: Collection[str]) -> list[str]:
     """Return the selected topics, settings and legs with reasons, as printed lines."""
     from odocal_ros.output.value_text import wrapped
@@ -186,12 +169,11 @@ def _overview(content: dict[str, Any], choices: list[_Choice], options: list[str
     for slot in sorted(mapping, key=lambda slot: wheels.get(slot, 2)):
         left = 'left ' * (slot == 'odometer' and 'odometer_right' in mapping)
         lines += wrapped(f'{left}{INPUTS[slot].label}: {mapping[slot]}{because.get(slot, "")}')
-    pairs = list(zip(options, options[1:], strict=False))
-    settings = [value for option, value in pairs if option == '--set']
+    settings = [value for option, value in options if option == '--set']
     lines += ['settings'] * bool(settings)
     for setting in settings:
         lines += wrapped(f'{setting}: {_setting_reason(setting, content, user_settings)}')
-    legs = [value for option, value in pairs if option == '--leg'] or [
+    legs = [value for option, value in options if option == '--leg'] or [
         f'{leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in content['legs']]
     lines += ['legs, seconds from the first message'] * bool(legs)
     return [*lines, *wrapped(', '.join(legs)), '']
@@ -212,9 +194,9 @@ def _setting_reason(setting: str, content: dict[str, Any], user_settings: Collec
             f'(1 sigma: {whole_degrees(mounting["forward_sigma"])} deg)')
 
 
-def _open_report(report: Path, never: bool) -> None:
+def _open_report(report: Path, no_browser: bool) -> None:
     import webbrowser
-    if never or not report.exists():
+    if no_browser or not report.exists():
         return
     # without a display, a text browser would take over the terminal
     display = sys.platform != 'linux' or any(

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which values of a list (joints, counters) are wheels, and on which side, by their motion."""
+"""Detection of wheels and their side among the values of a list (joints, counters), by motion."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -23,14 +23,15 @@ FIELDS = {JOINTS: ('position', 'velocity'), 'std_msgs/msg/Int32MultiArray': ('da
 
 
 class ListCollector:
-    """Collects all values of a topic of lists, messages in order."""
+    """Collects all values of a topic with lists; its messages come in order."""
 
     def __init__(self, msgtype: str) -> None:
         self.msgtype = msgtype
-        self._blocks: dict[tuple[Any, ...], list[Any]] = {}     # (field, keys) -> (stamps, values)
+        # (field, keys of its values) -> blocks of (stamps ns, arrival times ns, values)
+        self._blocks: dict[tuple[str, tuple[str, ...]], list[tuple[Ints, Ints, Floats]]] = {}
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints) -> None:
-        """Take messages; those that cannot be read as columns are skipped."""
+        """Store a block of messages; those that cannot be read as columns are skipped."""
         received = np.array(received_ns, np.int64)
         for layout, rows, table in tables(self.msgtype, raws):
             if layout is None:
@@ -39,7 +40,7 @@ class ListCollector:
             if not field:
                 continue
             n = layout.count(field)
-            keys = tuple(layout.names[:n]) or tuple(str(k) for k in range(n))
+            keys = tuple(layout.names[:n]) or tuple(map(str, range(n)))
             values = layout.columns(table, [f'{field}[{k}]' for k in range(len(keys))])
             stamp = layout.columns(table, ['header.stamp.sec', 'header.stamp.nanosec'])
             stamps = received[rows] if stamp is None else (
@@ -66,11 +67,11 @@ class ListCollector:
         if len(stamp_ns) < 3:
             return []
         t = (stamp_ns - stamp_ns[0]) * 1e-9
-        s = _travelled(t, value, field)
+        s = _travel(t, value, field)
         path_length, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
-        # rad: a joint with a larger range turns without limit
+        # two turns, rad: a joint with a larger range turns without limit
         min_span = 4 * np.pi if self.msgtype == JOINTS else 0
-        min_share = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
+        min_share = 0.3    # range of a wheel over the largest range of all values
         rolls = (span > min_span) & (span > min_share * span.max())
         # a joint that turns without driving, such as a lidar, is no wheel
         matches = [path.match(received_ns, travel) for travel in s.T] if path else []
@@ -85,12 +86,12 @@ class ListCollector:
                  'scale': scales[k]} for k, key in enumerate(keys)]
 
 
-def _travelled(t: Floats, value: Floats, field: str) -> Floats:
+def _travel(t: Floats, value: Floats, field: str) -> Floats:
     """Return the travel of each of k values, (n, k), from values (n, k) at t, (n,) s."""
     if field == 'velocity':
         return running_integral(t, value)
     if field == 'position':
-        inside = (np.abs(value) <= np.pi + 0.01).all(axis=0)
+        inside = (np.abs(value) <= np.pi + 0.01).all(axis=0)      # angles that wrap at pi
         return np.where(inside, np.unwrap(value, axis=0), value)
     return value
 
@@ -102,9 +103,9 @@ def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | 
     t, s : (n,) s and (n, k) travel.   rolls : (k,) wheels.   imu : s, and rad/s to the left.
     """
     sides = [''] * len(rolls)
-    cell = 0.5    # s, interval in which turn and travel are compared
+    interval = 0.5    # s, in which turn and travel are compared
     # with damaged stamps a recording may seem to last for years
-    grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MAX_DAYS * 86400 else np.empty(0)
+    grid = np.arange(t[0], t[-1], interval) if t[-1] - t[0] < MAX_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
         return sides
     turn = np.diff(np.interp(grid, imu[0], running_integral(*imu)))
@@ -125,15 +126,16 @@ def find_sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | 
 
 
 def single_wheel_setting(facts: list[dict[str, Any]], named: Sequence[str]) -> tuple[str, ...]:
-    """Return the setting for one wheel, if those found by name do not grow with distance."""
-    growing = [value for value in facts if value['scale']]
-    if not growing or named and {value['key'] for value in growing}.issuperset(named):
+    """Return the setting for one wheel, unless all wheels ``named`` grow with the distance."""
+    growing = {value['key']: value['field'] for value in facts if value['scale']}
+    if not growing or named and growing.keys() >= set(named):
         return ()
-    return (f'odometer.field={growing[0]["field"]}[{growing[0]["key"]}]',)
+    key, field = next(iter(growing.items()))
+    return (f'odometer.field={field}[{key}]',)
 
 
 def wheel_settings(facts: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Return the settings for the wheels found in the data, as many on either side; or none."""
+    """Return the settings for the wheels by side; none if left and right differ in number."""
     left, right = ([value['key'] for value in facts if value['side'] == side] for side in SIDES)
     if len(left) != len(right) or not left:
         return ()

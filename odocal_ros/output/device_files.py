@@ -68,11 +68,10 @@ FOR_IMU_ERRORS = """\
 def controllers(calibration: Calibration, config: Config,
                 content: dict[str, Any]) -> dict[str, str]:
     """Return file name -> text, empty if none of its values is determined."""
-    blocks = _blocks(calibration, config)
-    if not blocks:
-        return {}
-    return {CONTROLLERS: origin_comment(calibration, content) + FOR_CONTROLLERS + ''.join(
-        parameter_block(values, name) for name, values in blocks.items())}
+    blocks = ''.join(parameter_block(values, name)
+                     for name, values in _blocks(calibration, config).items())
+    origin = origin_comment(calibration, content)
+    return {CONTROLLERS: origin + FOR_CONTROLLERS + blocks} if blocks else {}
 
 
 def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any]]:

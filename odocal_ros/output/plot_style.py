@@ -3,8 +3,7 @@
 
 """Common parts of all figures: style, thinning of lines, units of axes, output as SVG or file."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 import io
 from itertools import pairwise
 from pathlib import Path
@@ -40,12 +39,10 @@ class Drawing(NamedTuple):
     svg: str      # element for HTML
 
 
-@contextmanager
-def apply_style() -> Iterator[None]:
-    """Apply the style while figures are made and written."""
+def apply_style() -> AbstractContextManager[None]:
+    """Return a context with the style, in which figures are made and written."""
     from matplotlib import rc_context
-    with rc_context(STYLE):
-        yield
+    return rc_context(STYLE)
 
 
 def new_figure_column(height: float, rows: int = 1, sharex: bool = True,

@@ -20,8 +20,6 @@ from odocal_ros.settings.config import Config
 
 NAME = 'report.html'
 MAX_BYTES = 2_600_000     # judgement: size of all figures; with tables, a page has less than 3 MB
-TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Warnings',
-          Verdict.ACCEPTED: 'Notes'}
 
 
 def report_html(calibration: result.Calibration, config: Config, content: dict[str, Any]) -> str:
@@ -33,13 +31,12 @@ def report_html(calibration: result.Calibration, config: Config, content: dict[s
 
     Raises ImportError: matplotlib or jinja2 is missing.
     """
-    legs, comparison, without_figures = _draw_figures(calibration)
-    # the first track is shown next to the verdict instead
-    first_track = legs[0]['figures'][:1] if legs else []
-    if first_track:
-        legs[0]['figures'] = legs[0]['figures'][1:]
-    return render_page('output', NAME, legs=legs, comparison=comparison, first_track=first_track,
-                       without_figures=without_figures, **_context(calibration, config, content))
+    with_figures = _with_figures(calibration)
+    # the track of the first leg is shown next to the verdict instead
+    first_leg = (with_figures['legs'] or [{'figures': []}])[0]
+    first_track, first_leg['figures'] = first_leg['figures'][:1], first_leg['figures'][1:]
+    return render_page('output', NAME, first_track=first_track, **with_figures,
+                       **_context(calibration, config, content))
 
 
 def render_page(package: str, name: str, **content: Any) -> str:
@@ -82,7 +79,7 @@ def _context(calibration: result.Calibration, config: Config,
         'headline': tables.headline(calibration),
         'values': tables.value_rows(calibration), 'undetermined': tables.undetermined(calibration),
         'why': _main_reason(calibration.reasons), 'rotation': rotation_text(calibration),
-        'reasons': grouped(calibration.reasons), 'check': check_table(legs),
+        'reasons': texts.reason_groups(calibration.reasons), 'check': check_table(legs),
         'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods, legs),
         'inputs': content['inputs'],
         'settings': tables.changed_settings(config),
@@ -92,24 +89,15 @@ def _context(calibration: result.Calibration, config: Config,
 
 def _main_reason(reasons: tuple[Reason, ...]) -> Reason | None:
     """Return the most severe reason against acceptance, or None; those on a value first."""
-    groups = grouped(reasons)
-    if not groups or groups[0][0] == Verdict.ACCEPTED.value:
-        return None
-    return min(groups[0][2], key=lambda r: r.code not in REASON_ESTIMATES)
-
-
-def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
-    """Return reasons by severity, the most severe first: (verdict, title, reasons)."""
-    joined = texts.join_same_reasons(reasons)
-    groups = [(verdict.value, title, [reason for reason in joined
-                                      if reason.code.severity is verdict])
-              for verdict, title in TITLES.items()]
-    return [group for group in groups if group[2]]
+    for verdict, _, group in texts.reason_groups(reasons)[:1]:
+        if verdict is not Verdict.ACCEPTED:
+            return min(group, key=lambda reason: reason.code not in REASON_ESTIMATES)
+    return None
 
 
 def _by_number_of_values(methods: dict[str, result.MethodResult],
                          estimates: dict[str, result.Estimate]) -> dict[str, result.MethodResult]:
-    """Return methods in order of the number of values that the result has from them."""
+    """Return methods, first the one that gives most of the estimates."""
     count = Counter(estimate.method for estimate in estimates.values()
                     if estimate.value is not None)
     return dict(sorted(methods.items(), key=lambda item: -count[item[0]]))
@@ -123,23 +111,23 @@ def _budgets(methods: dict[str, result.MethodResult],
             if (table := tables.budget_table(method, local))]
 
 
-def _draw_figures(
-        calibration: result.Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
-    """Return the content of each leg, the figure of all legs, and the legs without figures."""
+def _with_figures(calibration: result.Calibration) -> dict[str, Any]:
+    """Return the variables with figures: legs, comparison of all, numbers without figures."""
     # if figures exceed MAX_BYTES, only those of the newest legs are shown
     from odocal_ros.output.plots import leg_figures
     from odocal_ros.output.scale_plots import comparison_figure
     numbered, size = list(enumerate(calibration.legs, 1)), 0
     figures: dict[int, list[Drawing]] = {}
-    shown = [(number, leg, leg.evidence) for number, leg in numbered if leg.evidence is not None]
+    newest_first = sorted(numbered, key=lambda entry: entry[1].start_ns, reverse=True)
     with apply_style():
         comparison = comparison_figure(calibration, 'all')
-        for number, leg, evidence in sorted(shown, key=lambda entry: entry[1].start_ns,
-                                            reverse=True):
+        for number, leg in newest_first:
             if figures and size > MAX_BYTES:
                 break
+            if leg.evidence is None:
+                continue
             scale = texts.finite_estimate(leg_estimates(leg), 'scale_factor')
-            drawn = leg_figures(evidence, f'leg{number}', scale.relative_sigma,
+            drawn = leg_figures(leg.evidence, f'leg{number}', scale.relative_sigma,
                                 before_label([leg]), _smoother_details(leg))
             size += sum(len(figure.svg) for figure in drawn)
             if not figures or size <= MAX_BYTES:
@@ -149,7 +137,7 @@ def _draw_figures(
     # also of legs whose tracks were removed to save memory
     without_figures = [number for number, leg in numbered if number not in figures
                        and (leg.evidence is not None or leg.before is not None)]
-    return legs, comparison, without_figures
+    return {'legs': legs, 'comparison': comparison, 'without_figures': without_figures}
 
 
 def _leg(number: int, leg: result.LegResult, figures: list[Drawing],
@@ -167,12 +155,12 @@ def _leg(number: int, leg: result.LegResult, figures: list[Drawing],
             'methods': tables.method_table(methods, (leg,)),
             'budgets': _budgets(methods, (leg,)) if several else [],
             'check': check_table((leg,)),
-            'reasons': grouped(leg.reasons) if several else [],
+            'reasons': texts.reason_groups(leg.reasons) if several else [],
             'unused_data': rows, 'findings': findings,
             'normalised': _smoother_details(leg).get('residuals', {}).get('normalised')}
 
 
 def _smoother_details(leg: result.LegResult) -> dict[str, Any]:
-    """Return the details of the smoother for a leg, empty without it."""
+    """Return the details of the smoother's result, empty without one."""
     method = leg.methods.get('smoother')
     return method.details if method else {}

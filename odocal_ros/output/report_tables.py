@@ -37,13 +37,11 @@ def estimate_texts(name: str, estimate: result.Estimate) -> tuple[str, str, str]
     value, sigma, unit = estimate.value, estimate.sigma, estimate.unit
     if value is None:
         return UNDETERMINED, '', ''
-    in_si = texts.with_sigma(value, sigma) + (f' {unit}' if unit not in ('', '1') else '')
-    if unit == 'rad':
-        return f'{texts.with_sigma(value, sigma, DEG, signed=True)} deg', in_si, ''
-    if unit == 'rad/s':
-        return f'{texts.with_sigma(value, sigma, DEG_PER_HOUR, signed=True)} deg/h', in_si, ''
-    if unit == 's':
-        return f'{texts.with_sigma(value, sigma, 1e3, signed=True)} ms', in_si, ''
+    in_si = texts.with_sigma(value, sigma) + f' {unit}' * (unit not in ('', '1'))
+    usual_units = {'rad': (DEG, 'deg'), 'rad/s': (DEG_PER_HOUR, 'deg/h'), 's': (1e3, 'ms')}
+    if unit in usual_units:
+        factor, usual_unit = usual_units[unit]
+        return f'{texts.with_sigma(value, sigma, factor, signed=True)} {usual_unit}', in_si, ''
     if name.startswith('scale'):
         relative = texts.relative_text(sigma / abs(value)) if sigma and value else ''
         other = (texts.inverse_text(estimate) if unit in texts.COUNTS
@@ -157,17 +155,14 @@ def _column(name: str, estimate: result.Estimate) -> tuple[str, float]:
 
 def unused_data(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reason]]:
     """Return the unused fixes, counted by reason, and the findings about the leg's data."""
-    rows = []
-    if leg.evidence is not None:
-        counts = Counter(leg.evidence.excluded_because)
-        total = sum(counts.values())
-        times = leg.evidence.t_excluded
-        for reason, listed in counts.most_common():
-            t = [time for time, cause in zip(times, leg.evidence.excluded_because, strict=True)
-                 if cause == reason]
-            count = round(listed * leg.evidence.excluded / total)      # the list is thinned
-            rows.append((f'{count} of {leg.evidence.fixes + leg.evidence.excluded} fixes',
-                         f'{reason}; first at t = {min(t):.1f} s, last at t = {max(t):.1f} s'))
+    rows, evidence = [], leg.evidence
+    if evidence is not None:
+        for cause, listed in Counter(evidence.excluded_because).most_common():
+            t = evidence.t_excluded[np.array(evidence.excluded_because) == cause]
+            # the list is thinned
+            count = round(listed * evidence.excluded / len(evidence.excluded_because))
+            rows.append((f'{count} of {evidence.fixes + evidence.excluded} fixes',
+                         f'{cause}; first at t = {min(t):.1f} s, last at t = {max(t):.1f} s'))
     elif leg.rejected_fixes:
         rows.append((f'{leg.rejected_fixes} fixes', 'see the reasons'))
     return rows, [reason for reason in leg.reasons if reason.code in DATA_CODES]
@@ -175,9 +170,8 @@ def unused_data(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reas
 
 def changed_settings(config: Config) -> list[tuple[str, str, str]]:
     """Return the settings that are not at their default: name, value, default."""
-    return [(name, _shown(value), _shown(SETTINGS[name].default))
-            for name, value in flat(config).items() if _shown(value) != _shown(
-                SETTINGS[name].default)]
+    return [(name, value_text, default_text) for name, value in flat(config).items()
+            if (value_text := _shown(value)) != (default_text := _shown(SETTINGS[name].default))]
 
 
 def _shown(value: Any) -> str:
@@ -189,17 +183,16 @@ def _shown(value: Any) -> str:
 
 
 def full_digits(content: dict[str, Any]) -> list[tuple[str, str, str, str, str]]:
-    """Return each number of the result as in calibration.json: name, value, sigma, ..."""
+    """Return the numbers of the result in calibration.json: name, value, sigma, unit, method."""
     rows = []
     for name, entry in content['result'].items():
         if name in result.NOT_ESTIMATES:
-            rows += [(f'{name.replace("_", " ")}, {key.replace("_", " ")}',
-                      UNDETERMINED if x is None else ', '.join(
-                          map(repr, np.atleast_1d(x).tolist())),
-                      '', '', '') for key, x in entry.items() if key != 'unit']
+            rows += [(f'{name} {key}'.replace('_', ' '), UNDETERMINED if numbers is None else
+                      ', '.join(map(repr, np.atleast_1d(numbers).tolist())), '', '', '')
+                     for key, numbers in entry.items() if key != 'unit']
         else:
-            rows.append((name, *(UNDETERMINED if entry[k] is None else repr(entry[k])
-                                 for k in ('value', 'sigma')),
+            rows.append((name, *(UNDETERMINED if entry[key] is None else repr(entry[key])
+                                 for key in ('value', 'sigma')),
                          entry['unit'] or '', entry['method'] or ''))
     return rows
 

@@ -13,19 +13,25 @@ from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.data.arrays import Floats
 from odocal_ros.output import plot_style as style
 from odocal_ros.output.summary import DEG
-from odocal_ros.output.value_text import ANGLES, finite_estimate, with_sigma
+from odocal_ros.output.value_text import ANGLES, finite_estimate, MAIN_VALUES, with_sigma
 
 STYLES = (('o', style.BLUE), ('s', style.RED), ('^', style.GREEN), ('D', style.PINK),
           ('v', 'black'), ('P', style.GREY))
 MAX_LEGS = 40    # judgement: bars that are distinguishable in a picture
-# text on the leg, name of the method, its estimates
-Row = tuple[str, str, dict[str, Estimate]]
+
+
+class MethodEstimates(NamedTuple):
+    """The estimates of a method from one leg or all."""
+
+    label: str
+    method: str
+    estimates: dict[str, Estimate]
 
 
 class Point(NamedTuple):
     """A value with its sigma, in the unit of a panel."""
 
-    text: str
+    label: str
     method: str
     value: float
     sigma: float
@@ -56,7 +62,7 @@ def draw_by_speed(ax: Any, scale: SpeedScale) -> None:
 
 
 def fit_text(scale: SpeedScale) -> str:
-    """Return the fit in words; '' if the speeds of the leg do not determine it."""
+    """Return the fit as a sentence, '' if the speeds of the leg do not determine it."""
     if not (scale.factor and scale.offset and scale.lag):
         return ''
     offset, lag = scale.offset, scale.lag
@@ -68,7 +74,6 @@ def fit_text(scale: SpeedScale) -> str:
 
 
 def by_speed(scale: SpeedScale, name: str) -> style.Drawing:
-    """Return the figure of a leg: title, description, svg element."""
     figure, (ax,) = style.new_figure_column(2.7)
     draw_by_speed(ax, scale)
     style.add_legend(figure, ax)
@@ -99,44 +104,36 @@ def by_window(windows: Floats, name: str) -> style.Drawing:
 
 def comparison_figure(calibration: Calibration, name: str) -> list[style.Drawing]:
     """Draw scale, yaw and pitch by method and leg; empty for single values."""
-    rows = [(f'all legs, {name.replace("_", " ")}', name, method.estimates)
-            for name, method in calibration.methods.items()] if len(calibration.legs) > 1 else []
-    for number, leg in list(enumerate(calibration.legs, 1))[-MAX_LEGS:]:
-        rows += [(f'leg {number}, {name.replace("_", " ")}', name, method.estimates)
-                 for name, method in leg.methods.items()]
-    panels = [panel for panel in (
-        _scale_panel(calibration, rows),
-        *(_angle_panel(calibration, rows, angle) for angle in ANGLES)) if len(panel.points) > 1]
+    legs = [(f'leg {number}', leg.methods) for number, leg in enumerate(calibration.legs, 1)]
+    both = [('all legs', calibration.methods)] * (len(legs) > 1) + legs[-MAX_LEGS:]
+    rows = [MethodEstimates(f'{label}, {method.replace("_", " ")}', method, values.estimates)
+            for label, methods in both for method, values in methods.items()]
+    panels = [panel for parameter in MAIN_VALUES
+              if len((panel := _panel(calibration, rows, parameter)).points) > 1]
     return [_draw_panels(panels, name, len(calibration.legs))] if panels else []
 
 
-def _scale_panel(calibration: Calibration, rows: list[Row]) -> Panel:
-    """Return the panel of scales, relative to the result."""
-    result = finite_estimate(calibration.estimates, 'scale_factor')
-    points = []
-    for text, method, estimates in rows:
-        scale = finite_estimate(estimates, 'scale_factor')
-        if scale.value is not None and result.value:
-            points.append(Point(text, method, scale.value / result.value - 1,
-                                (scale.sigma or 0.0) / abs(result.value)))
-    factor, unit = relative_unit(max((abs(point.value) + point.sigma for point in points),
-                                     default=0.0))
-    band = (0.0, (result.sigma or 0.0) / abs(result.value) * factor) if result.value else None
-    return Panel(f'scale minus result, {unit}', [
-        point._replace(value=point.value * factor, sigma=point.sigma * factor)
-        for point in points], band)
-
-
-def _angle_panel(calibration: Calibration, rows: list[Row], name: str) -> Panel:
-    """Return the panel of a mounting angle, deg."""
+def _panel(calibration: Calibration, rows: list[MethodEstimates], name: str) -> Panel:
+    """Return the panel of a mounting angle, deg, or of the scale relative to the result."""
     result = finite_estimate(calibration.estimates, name)
-    points = []
-    for text, method, estimates in rows:
-        angle = finite_estimate(estimates, name)
-        if angle.value is not None:
-            points.append(Point(text, method, angle.value * DEG, (angle.sigma or 0.0) * DEG))
-    band = None if result.value is None else (result.value * DEG, (result.sigma or 0.0) * DEG)
-    return Panel(f'{ANGLES[name]} mounting angle, deg', points, band)
+    known = [(row, estimate) for row in rows
+             if (estimate := finite_estimate(row.estimates, name)).value is not None]
+    if name in ANGLES:
+        title, factor = f'{ANGLES[name]} mounting angle, deg', DEG
+        points = [Point(row.label, row.method, angle.value or 0.0, angle.sigma or 0.0)
+                  for row, angle in known]
+        band = None if result.value is None else (result.value * DEG, (result.sigma or 0.0) * DEG)
+    elif result.value:
+        points = [Point(row.label, row.method, (scale.value or 0.0) / result.value - 1,
+                        (scale.sigma or 0.0) / abs(result.value)) for row, scale in known]
+        factor, unit = relative_unit(max((abs(point.value) + point.sigma for point in points),
+                                         default=0.0))
+        title = f'scale minus result, {unit}'
+        band = 0.0, (result.sigma or 0.0) / abs(result.value) * factor
+    else:
+        return Panel('', [], None)
+    return Panel(title, [point._replace(value=point.value * factor, sigma=point.sigma * factor)
+                         for point in points], band)
 
 
 def _draw_panels(panels: list[Panel], name: str, legs: int) -> style.Drawing:
@@ -156,7 +153,7 @@ def _draw_panels(panels: list[Panel], name: str, legs: int) -> style.Drawing:
             marker, colour = styles[point.method]
             ax.errorbar(point.value, row, xerr=point.sigma, fmt=marker, color=colour, markersize=5,
                         capsize=3, linewidth=1.1)
-        ax.set_yticks(range(len(panel.points)), [point.text for point in panel.points])
+        ax.set_yticks(range(len(panel.points)), [point.label for point in panel.points])
         ax.set_ylim(len(panel.points) - 0.5, -0.5)
         ax.set_xlabel(panel.title)
     text = 'Bars: one sigma to each side; grey band: the result.' + (

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 import json
 import math
 from pathlib import Path
+import sys
 from typing import Any, TypeVar
 
 from odocal_ros.calib.marginal_information import CarriedInformation, read_carried
 from odocal_ros.calib.result import Estimate, NOT_ESTIMATES, wheel_factors
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import MAIN, plain, SCHEMA
-from odocal_ros.output.value_text import with_sigma, with_unit
+from odocal_ros.output.value_text import angle_text, with_unit
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.safe_io.limits import read_bytes
 from odocal_ros.settings.config import Config, flat
@@ -44,7 +45,6 @@ class Stored:
 
     @property
     def usable(self) -> bool:
-        """Return True unless the result is rejected."""
         return self.verdict is not Verdict.REJECTED
 
     def value(self, name: str) -> float | None:
@@ -130,9 +130,9 @@ def known_imu(config: Config) -> CarriedInformation | None:
 
 def _entry(content: dict[str, Any], key: str, kind: type[T]) -> T:
     """Return an entry of a type, or raise ValueError."""
-    if not isinstance(content.get(key), kind):
+    entry = content.get(key)
+    if not isinstance(entry, kind):
         raise ValueError(f'{key!r} is missing or has the wrong type')
-    entry: T = content[key]
     return entry
 
 
@@ -161,13 +161,9 @@ def _number(value: float | None, key: str) -> float | None:
     """Return a finite number or None, or raise ValueError."""
     if value is None:
         return None
-    try:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) \
-                or not math.isfinite(value):
-            raise ValueError(f'{key} is not a number')
-        return float(value)
-    except OverflowError:
-        raise ValueError(f'{key} is too large') from None
+    if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:    # False: nan
+        raise ValueError(f'{key} is not a finite number')
+    return float(value)
 
 
 def _budget(methods: dict[str, dict[str, Any]], method: str | None,
@@ -175,8 +171,8 @@ def _budget(methods: dict[str, dict[str, Any]], method: str | None,
     """Return the budget of a parameter; empty without a readable one."""
     entry = methods.get(method) if isinstance(method, str) else None
     budget = entry.get('budget') if isinstance(entry, dict) else None
-    rows = budget.items() if isinstance(budget, dict) else ()
-    return {source: (float(row[parameter]), row.get('shared') is True) for source, row in rows
+    return {source: (row[parameter], row.get('shared') is True)
+            for source, row in (budget.items() if isinstance(budget, dict) else ())
             if isinstance(row, dict) and isinstance(row.get(parameter), float)
             and math.isfinite(row[parameter])}
 
@@ -224,9 +220,7 @@ def _worse(label: str, old: Estimate | None, new: Estimate | None) -> str:
 
 def estimate_text(estimate: Estimate) -> str:
     """Return a value with sigma and unit as text; angles in deg."""
-    if estimate.unit == 'rad':
-        return with_sigma(estimate.value, estimate.sigma, math.degrees(1.0), signed=True) + ' deg'
-    return with_unit(estimate)
+    return angle_text(estimate) if estimate.unit == 'rad' else with_unit(estimate)
 
 
 def stored_in(folder: Path) -> Stored | None:

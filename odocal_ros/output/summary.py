@@ -71,9 +71,7 @@ def values_in_words(estimates: dict[str, result.Estimate]) -> str:
             parts.append(f'{label} {texts.with_unit(wheel)}')
     for name, label in _angles_of(estimates).items():
         angle = texts.finite_estimate(estimates, name)
-        parts.append(f'{label} mounting ' + (
-            'not determined' if angle.value is None else
-            f'{texts.with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
+        parts.append(f'{label} mounting {texts.angle_text(angle)}')
     return ', '.join(parts)
 
 
@@ -93,13 +91,14 @@ def driven_text(legs: tuple[result.LegResult, ...]) -> str:
 
 
 def _value_lines(calibration: result.Calibration, width: int) -> list[str]:
-    """Return a line for each value."""
     estimates, local = calibration.estimates, result.has_local_positions(calibration.legs)
     wheels, rotation = _wheel_lines(estimates), rotation_text(calibration, width)
     lines = _scale_lines(calibration)
     for name, label in _angles_of(estimates).items():
         angle = texts.finite_estimate(estimates, name)
-        lines.append(_line(f'{label} mounting', _angle_text(angle, width)))
+        rad = '' if angle.value is None or width < texts.WIDTH else (
+            f'   ({texts.with_sigma(angle.value, angle.sigma, signed=True)} rad)')
+        lines.append(_line(f'{label} mounting', texts.angle_text(angle) + rad))
     lines += [*_largest_error_lines(calibration, width), *wheels.values(),
               *_other_lines(estimates, wheels),
               *(_lever_arm_line(estimates, name, result.name_antenna(label, local), width)
@@ -249,14 +248,6 @@ def _scale_text(scale: result.Estimate) -> str:
         return 'not determined'
     relative = scale.relative_sigma
     return texts.with_unit(scale) + (f'   ({texts.relative_text(relative)})' if relative else '')
-
-
-def _angle_text(angle: result.Estimate, width: int) -> str:
-    if angle.value is None:
-        return 'not determined'
-    rad = '' if width < texts.WIDTH else (
-        f'   ({texts.with_sigma(angle.value, angle.sigma, signed=True)} rad)')
-    return f'{texts.with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg{rad}'
 
 
 def _leg_table(legs: tuple[result.LegResult, ...], width: int) -> list[str]:

@@ -47,8 +47,7 @@ def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
 
 def deviation_text(ratio: float, sigma: float | None) -> str:
     """Return a ratio minus 1 as text, in ppm or per cent."""
-    known_sigma = sigma if sigma is not None and math.isfinite(sigma) else 0.0
-    factor, unit = relative_unit(ratio - 1, known_sigma)
+    factor, unit = relative_unit(ratio - 1, sigma or 0.0)
     return f'{with_sigma(ratio - 1, sigma, factor, signed=True)} {unit}'
 
 
@@ -104,6 +103,12 @@ def finite_estimate(estimates: dict[str, Estimate], name: str) -> Estimate:
     value, sigma = (x if x is not None and math.isfinite(x) else None
                     for x in (estimate.value, estimate.sigma))
     return replace(estimate, value=value, sigma=sigma)
+
+
+def angle_text(angle: Estimate) -> str:
+    """Return an angle, rad, as 'value ± sigma deg', or 'not determined'."""
+    return 'not determined' if angle.value is None else (
+        f'{with_sigma(angle.value, angle.sigma, math.degrees(1.0), signed=True)} deg')
 
 
 def with_unit(estimate: Estimate) -> str:
@@ -188,17 +193,24 @@ def lines_of_bags(legs: tuple[LegResult, ...], width: int) -> list[str]:
     return wrapped(listed, '  ', '   ', width)
 
 
+def reason_groups(reasons: tuple[Reason, ...]) -> list[tuple[Verdict, str, list[Reason]]]:
+    """Return reasons by severity, the most severe first: (verdict, title, reasons)."""
+    joined = join_same_reasons(reasons)
+    return [(verdict, title, group) for verdict, title in (
+        (Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'warnings'),
+        (Verdict.ACCEPTED, 'notes'))
+        if (group := [reason for reason in joined if reason.code.severity is verdict])]
+
+
 def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool) -> list[str]:
     """Return reasons with their remedies for a terminal; brief: only the codes of notes."""
     lines = []
-    for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'warnings'),
-                           (Verdict.ACCEPTED, 'notes')):
-        group = [r for r in join_same_reasons(reasons) if r.code.severity is verdict]
-        if brief and group and verdict is Verdict.ACCEPTED:
-            codes = ', '.join(dict.fromkeys(r.code.name for r in group))
+    for verdict, title, group in reason_groups(reasons):
+        if brief and verdict is Verdict.ACCEPTED:
+            codes = ', '.join(dict.fromkeys(reason.code.name for reason in group))
             lines += wrapped(f'notes, see the report: {codes}', '  ', '   ', width)
             continue
-        lines += [f'  {title}'] * bool(group)
+        lines.append(f'  {title}')
         for reason in group:
             lines += wrapped(str(reason), '    ', '   ', width)
             lines += wrapped(f'-> {reason.remedy}', '      ', '   ', width)

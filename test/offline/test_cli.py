@@ -26,12 +26,12 @@ pytestmark = pytest.mark.core
 OWN = [name for name, (home, _) in cli.COMMANDS.items() if home.startswith('odocal_ros.')]
 SETUP = Path(__file__).resolve().parents[2] / 'setup.py'
 CODE = """
-from odocal_ros.offline.cli import Phase
-with Phase('reading town', quiet={quiet}) as phase:
+from odocal_ros.offline.cli import show_phase
+with show_phase('reading town', quiet={quiet}) as phase:
     phase(0.25)
     phase(0.5, 'leg 2 of 2')
     phase(None, 'smoother, 7 passes done')
-with Phase('drawing the report'):
+with show_phase('drawing the report'):
     pass
 print('the result')
 """

@@ -182,7 +182,8 @@ def test_unusable_fixes_are_reported(inspect_drive):
     assert 'COVARIANCE_UNKNOWN' in codes(seen)
     seen, _ = inspect_drive([row for row in drive() if row[0] != '/fix'])
     assert [(f['text'], f['remedy']) for f in seen['findings'] if f['code'] == 'NO_FIX'] == [
-        ('no topic for the fixes', 'Record it, or name it with --fix-topic.')]
+        ('no topic for the fixes', 'Record sensor_msgs/NavSatFix, or name a topic of positions '
+         'with --fix-topic.')]
     assert len(seen['standstills']) == 2            # found without fixes
 
 

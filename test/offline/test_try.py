@@ -73,7 +73,7 @@ def test_the_likeliest_topic_is_used_and_the_command_gives_the_same_result(bag, 
         '(--odometer-topic)' in ' '.join(out.split())
     assert '  IMU: /imu/data\n  fix: /fix\n' in out
     assert 'error budget' not in out
-    command = out.rpartition('next time:\n')[2].strip()
+    command = out.rpartition('to repeat this calibration:\n')[2].strip()
     assert re.match(r'odocal replay bag --odometer-topic /odometer .*--force$', command)
     first = content_of(tmp_path / 'odocal_bag')
     assert main(shlex.split(command)[1:]) == 0
@@ -100,7 +100,7 @@ def test_options_of_the_user_are_passed_to_the_replay(bag, tmp_path, capsys):
                  '--set', 'method=two_point', '--set', 'odometer.nominal_scale=0.02',
                  '--output', 'out']) in (0, 1)
     out = capsys.readouterr().out
-    command = out.rpartition('next time:\n')[2]
+    command = out.rpartition('to repeat this calibration:\n')[2]
     assert '--odometer-topic /wheel/ticks' in command
     assert command.count('--leg') == 1
     assert 'because' not in out
@@ -133,7 +133,8 @@ def test_a_bag_without_odometer_and_fixes_shows_its_topics(tmp_path, monkeypatch
     write_bag(tmp_path / 'bag', [imu('/imu/data', drive(scenario='straight', duration=200.0).imu)])
     assert main(['try', 'bag']) == 2
     out, err = capsys.readouterr()
-    assert 'no usable topic for: odometer, fix' in err
+    assert 'no topic for the odometer. Record pulses, joint angles' in err
+    assert 'no topic for the fixes. Record sensor_msgs/NavSatFix' in err
     assert err.count('\n') == 1
     assert '/imu/data' in out
     assert 'NO_ODOMETER' not in out       # the error states it
@@ -169,9 +170,10 @@ def test_the_rate_of_equal_stamps_is_unknown(tmp_path, monkeypatch, capsys):
 def test_options_of_the_user_replace_the_suggested_ones():
     command = "odocal replay bag --leg 1:2 --set 'imu.mounting_rpy=[0, 0, 1]' --leg 5:9"
     for leg, settings, kept in (
-            (['3:4'], [], ['--set', 'imu.mounting_rpy=[0, 0, 1]']),
-            ([], [], ['--leg', '1:2', '--set', 'imu.mounting_rpy=[0, 0, 1]', '--leg', '5:9']),
-            ([], ['imu.mounting_rpy=[0,0,0]'], ['--leg', '1:2', '--leg', '5:9'])):
+            (['3:4'], [], [('--set', 'imu.mounting_rpy=[0, 0, 1]')]),
+            ([], [], [('--leg', '1:2'), ('--set', 'imu.mounting_rpy=[0, 0, 1]'),
+                      ('--leg', '5:9')]),
+            ([], ['imu.mounting_rpy=[0,0,0]'], [('--leg', '1:2'), ('--leg', '5:9')])):
         given = argparse.Namespace(leg=leg, settings=settings)
         assert try_bag._suggested_options(command, given) == kept
 

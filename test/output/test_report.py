@@ -129,18 +129,18 @@ def test_untrusted_names_are_text_not_markup(good):
 
 def test_the_report_of_many_legs_stays_within_the_size_limit(good, monkeypatch):
     # room for the figures of one leg and a half
-    one = sum(len(drawing) for leg in report._draw_figures(drawn(good))[0]
-              for *_, drawing in leg['figures'])
-    monkeypatch.setattr(report, 'MAX_BYTES', 3 * one // 2)
+    size = sum(len(figure.svg) for leg in report._with_figures(drawn(good))['legs']
+               for figure in leg['figures'])
+    monkeypatch.setattr(report, 'MAX_BYTES', 3 * size // 2)
     leg = replace(good.legs[0], evidence=evidence())
     legs = tuple(replace(leg, start_ns=leg.start_ns + k * 10**12) for k in range(3))
     _, text, _ = page_of(replace(good, legs=legs))
     assert 'figures of the newest legs only, none of legs 1, 2.' in text
     # the newest leg is always shown, whatever its size
     monkeypatch.setattr(report, 'MAX_BYTES', 10)
-    reported, _, missing = report._draw_figures(replace(good, legs=legs))
-    assert [bool(leg['figures']) for leg in reported] == [False, False, True]
-    assert missing == [1, 2]
+    variables = report._with_figures(replace(good, legs=legs))
+    assert [bool(leg['figures']) for leg in variables['legs']] == [False, False, True]
+    assert variables['without_figures'] == [1, 2]
 
 
 def test_a_page_is_reproducible_and_does_not_change_matplotlib_settings(good):
