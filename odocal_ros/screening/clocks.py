@@ -66,7 +66,7 @@ def stamp_offsets(config: Config) -> dict[str, float]:
 
 
 def clock_differences(leg: Leg, config: Config) -> dict[str, float]:
-    """Return s ahead of IMU stamps that arrive at the same time, of topics beyond the limit."""
+    """Return by how many s stamps lead IMU stamps of equal arrival, of topics beyond the limit."""
     offset = stamp_offsets(config)
     differences: dict[str, float] = {}
     imu = _stamped(leg.imu)

@@ -25,19 +25,19 @@ from odocal_ros.settings.nominal import G
 # after the turn
 MIN_IMU_TURN, GRAVITY_SCATTER = 45.0, 20.0
 # judgement: largest ratio of gravity after a turn and before; 1.4 in a bend at 45 deg
-GRAVITY_RATIO = 1.15
+GRAVITY_CHANGE = 1.15
 # judgement, deg: a larger turn is by reversing with an unsigned counter (180 deg)
 LARGEST_YAW_TURN = 135.0
 YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond MIN_IMU_TURN
-REMEDY = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
+MOVED_REMEDY = 'Mount the IMU firmly, or mark a leg before or after this with --leg.'
 TENTHS, MIN_TENTH_ROWS = 10, 20       # judgement: sections of a leg; least rows of one
 # judgement: limits of measured gravity over the Earth's. Units and ranges differ by a factor of 2
 # at least; in a continuous bend at 1.2 g the force is 1.56 times gravity
-MIN_RATIO, MAX_RATIO = 0.6, 1.6
+MIN_GRAVITY_RATIO, MAX_GRAVITY_RATIO = 0.6, 1.6
 MIXED_SHARE = 0.01     # judgement: share of all messages; fewer are damaged, not a second IMU
 # judgement, for the test of alternating rows: rows of a block; least and largest number of blocks,
 # from the end of the leg; ratio of an outlier to the median; largest share of repeated rows
-MEAN_ROWS, MIN_MEANS, MAX_MEANS, OUTLIER_RATIO, REPEATED_SHARE = 50, 40, 2000, 10.0, 0.2
+BLOCK_ROWS, MIN_BLOCKS, MAX_BLOCKS, OUTLIER_RATIO, REPEATED_SHARE = 50, 40, 2000, 10.0, 0.2
 # statistical: F of the regression of odd minus even rows on a constant and the signals. For one
 # IMU it is 14 at most (25 zoo drives); for two with axes 3 deg apart or other biases 50 and more
 MIN_F_STATISTIC = 30.0
@@ -64,14 +64,15 @@ def unit_change_reasons(inputs: Inputs) -> tuple[Reason, ...]:
     """Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's."""
     edges, force = _tenths(inputs)
     gravity = np.linalg.norm(force, axis=1).tolist()
-    wrong = [k for k, g in enumerate(gravity) if not MIN_RATIO * G < g < MAX_RATIO * G]
+    wrong = [k for k, size in enumerate(gravity)
+             if not MIN_GRAVITY_RATIO * G < size < MAX_GRAVITY_RATIO * G]
     if not wrong or len(wrong) == len(gravity):      # all tenths: the unit of the whole leg
         return ()
     begin, end = inputs.t_imu[edges[wrong[0]]], inputs.t_imu[edges[wrong[-1] + 1] - 1]
     return (Reason(Code.IMU_UNITS, f'from t = {begin:.0f} to {end:.0f} s the IMU measures a '
                    f'gravity of {gravity[wrong[0]]:.3g} m/s^2 instead of 9.8 m/s^2',
                    'Check the IMU driver for a change of unit or range during the drive, or mark '
-                   'a leg on one side of it with --leg.'),)
+                   'a leg before or after it with --leg.'),)
 
 
 def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
@@ -85,7 +86,7 @@ def gravity_turn_reasons(inputs: Inputs) -> tuple[Reason, ...]:
         turn_deg = _angle_between(before, after)
         scatter = [_angle_between(tenth, mean) for side, mean in zip(
             sides, (before, after), strict=True) for tenth in side]
-        if (turn_deg > MIN_IMU_TURN and 1 / GRAVITY_RATIO < ratio < GRAVITY_RATIO
+        if (turn_deg > MIN_IMU_TURN and 1 / GRAVITY_CHANGE < ratio < GRAVITY_CHANGE
                 and max(scatter) < GRAVITY_SCATTER):
             begin, end = inputs.t_imu[edges[k]], inputs.t_imu[edges[k + 1] - 1]
             return (_imu_moved_reason(f'gravity turns by {turn_deg:.0f} deg', float(begin),
@@ -117,7 +118,7 @@ def forward_turn_reasons(binned: Accelerations | None) -> tuple[Reason, ...]:
 
 def _imu_moved_reason(observation: str, begin: float, end: float) -> Reason:
     return Reason(Code.IMU_AXES, f'{observation} in the IMU frame at about t = {begin:.0f} to '
-                  f'{end:.0f} s: the IMU was moved in the vehicle', REMEDY)
+                  f'{end:.0f} s: the IMU was moved in the vehicle', MOVED_REMEDY)
 
 
 def _angle_between(first: Floats, second: Floats) -> float:
@@ -166,17 +167,17 @@ def _share_of_second_imu(x: Floats) -> float:
     IMU adds a constant (another bias) and a combination of the signals (other axes); the F test
     decides whether a fit of both is significant.   x : (n, 3) rows.
     """
-    x = x[-MAX_MEANS * MEAN_ROWS - 2:]
-    count = (len(x) - 2) // MEAN_ROWS
-    if count < MIN_MEANS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED_SHARE:
+    x = x[-MAX_BLOCKS * BLOCK_ROWS - 2:]
+    count = (len(x) - 2) // BLOCK_ROWS
+    if count < MIN_BLOCKS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED_SHARE:
         return 0.0
     odd_minus_even = np.where(np.arange(len(x) - 2) % 2, -0.5, 0.5)[:, None] \
         * (x[1:-1] - (x[:-2] + x[2:]) / 2)
-    blocks = odd_minus_even[:count * MEAN_ROWS].reshape(count, MEAN_ROWS, 3)
+    blocks = odd_minus_even[:count * BLOCK_ROWS].reshape(count, BLOCK_ROWS, 3)
     difference = blocks.mean(axis=1)
     size = np.abs(difference).max(axis=1)
     is_usual = size <= OUTLIER_RATIO * np.median(size)
-    mean = x[1:count * MEAN_ROWS + 1].reshape(blocks.shape).mean(axis=1)[is_usual]
+    mean = x[1:count * BLOCK_ROWS + 1].reshape(blocks.shape).mean(axis=1)[is_usual]
     # scale blocks to equal noise: one that tilts and vibrates more would dominate the fit
     blocks, design = blocks[is_usual], np.column_stack([np.ones(len(mean)), mean])
     noise = np.sqrt((blocks**2).mean(axis=(1, 2)))
@@ -193,14 +194,14 @@ def _significant_share(difference: Floats, design: Floats, power: Floats) -> flo
     of single rows.
     """
     freedom = len(difference) - design.shape[1]
-    if freedom < MIN_MEANS // 2:
+    if freedom < MIN_BLOCKS // 2:
         return 0.0
     residual = difference - design @ np.linalg.lstsq(design, difference, rcond=None)[0]
     unexplained, total = (residual**2).sum(axis=0), (difference**2).sum(axis=0)
     lagged = (residual[1:] * residual[:-1]).sum(axis=0)
     explained = total - unexplained
     significant = (explained * freedom > MIN_F_STATISTIC * design.shape[1] * unexplained) & (
-        explained / len(difference) > MIN_EXPLAINED_VARIANCE * power / MEAN_ROWS)
+        explained / len(difference) > MIN_EXPLAINED_VARIANCE * power / BLOCK_ROWS)
     is_vibration = lagged > np.maximum(CORRELATION_LIMIT * unexplained,
                                        SLOW_SHARE_LIMIT * explained)
     if is_vibration[np.argmax(explained / np.maximum(power, 1e-300))]:

@@ -96,11 +96,12 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
         if jump <= last_false:
             continue
         frozen_from = _first_zero_step(step, jump)
-        candidates = [(frozen_from, jump)] * (frozen_from < jump) + [      # first and last step
+        # first and last step of false rows: before the jump, or from it to a jump back
+        candidates = [(frozen_from, jump)] * (frozen_from < jump) + [
             (jump, k) for k in jumps if k > jump and t[k + 1] - t[jump] <= max_duration]
         for first, last in candidates:
             travel = counter_steps(value[[first, last + 1]], modulus)[0]    # exact, unlike sums
-            max_travel = 1.2 * high_rate * (t[last + 1] - t[first]) + 3
+            max_travel = 1.2 * high_rate * (t[last + 1] - t[first]) + 3      # counts
             jumps_back = first == jump and abs(travel) <= max_travel and (
                 min(abs(step[first]), abs(step[last])) > 2 * max_travel)
             if jumps_back or _fits_adjacent_rates(t, travel, rate, first, last):
@@ -119,7 +120,7 @@ def repeated_counts(value: Values, modulus: int) -> Bools:
     interval of updates, counted back from the next update.
     """
     size = np.abs(counter_steps(value, modulus))
-    update = np.flatnonzero(size) + 1
+    update = np.flatnonzero(size) + 1      # rows with a new value
     interval_rows = np.diff(update)
     # judgement: rows without counts between updates of only one or two counts are slow motion
     min_counts = 3.0

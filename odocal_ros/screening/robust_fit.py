@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Linear regression with limited influence of outliers, by Tukey's biweight."""
+"""Linear regression in which outliers have no influence: Beaton and Tukey 1974, biweight."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -35,7 +35,7 @@ def robust_fit(A: Floats, y: Floats, min_sigma: float,
     """
     column_size = np.abs(A).max(axis=0)
     column_size[column_size == 0] = 1.0
-    A = A / column_size
+    A = A / column_size      # a coefficient then has the unit of y
     information = np.zeros(A.shape[1]) if prior is None else (
         1 / (np.asarray(prior) * column_size)**2)
     weight, sigma = np.ones(len(y)), 0.0

@@ -49,15 +49,15 @@ def screen(leg: Leg, config: Config,
     check_faults : False if only its motion is needed: faults of clocks, gyro and wheels are not
     tested, and orientations are unchanged.
     """
-    leg, levelled = with_assumed_force(leg, config)
-    leg, local = without_north(leg, config)
-    reasons: list[Reason] = [*levelled, *local, *other_frame_reasons(leg, config.imu)]
+    leg, force_reasons = with_assumed_force(leg, config)
+    leg, frame_reasons = without_north(leg, config)
+    reasons = [*force_reasons, *frame_reasons, *other_frame_reasons(leg, config.imu)]
     reasons += _missing(leg, reasons)
     clock_differences: dict[str, float] = {}
     if check_faults:
-        leg, clock_steps = clocks.without_clock_steps(leg)
+        leg, step_reasons = clocks.without_clock_steps(leg)
         clock_differences = clocks.clock_differences(leg, config)
-        reasons += [*clock_steps, *clocks.clock_reasons(clock_differences)]
+        reasons += [*step_reasons, *clocks.clock_reasons(clock_differences)]
     rows, wheels, row_reasons = _usable_topics(leg, config, check_faults)
     fixes, fix_reasons = _fix_fields(leg, config, rows)
     reasons += row_reasons + fix_reasons
@@ -68,8 +68,9 @@ def screen(leg: Leg, config: Config,
         w_b=_rotated(imu.w_i, config.imu.gyro_scale, C_bi),
         f_b=_rotated(imu.f_i, config.imu.accel_scale, C_bi),
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
-        scale_unit=leg.form.scale_unit, has_accelerometer=not levelled, is_local=bool(local),
-        clock_differences=clock_differences, **_travel_fields(leg, wheels), **fixes)
+        scale_unit=leg.form.scale_unit, has_accelerometer=not force_reasons,
+        is_local=bool(frame_reasons), clock_differences=clock_differences,
+        **_travel_fields(leg, wheels), **fixes)
     # the mean has the rows of the first wheel
     for slot, wheel in zip(leg.wheel_slots, (wheels.mean, *wheels.wheels[1:]), strict=False):
         reasons += topic_gap(slot, wheel.t)
@@ -84,32 +85,32 @@ def screen(leg: Leg, config: Config,
             reasons += axle_reasons
         inputs = replace(inputs, **_travel_fields(leg, wheels))
     release_mapped_memory()
-    if check_faults and not local:
+    if check_faults and not inputs.is_local:
         inputs, reckoned_reasons = _without_dead_reckoned(inputs, config)
         reasons += reckoned_reasons
-    if not levelled:
-        inputs, reversing = _without_reversing(inputs, config)
-        reasons += reversing
+    if inputs.has_accelerometer:
+        inputs, direction_reasons = _without_reversing(inputs, config)
+        reasons += direction_reasons
     return inputs, tuple(reasons)
 
 
 def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason, ...]]:
     """Return a leg with all stamps on the clock of the IMU, its inputs, and all reasons."""
     inputs, reasons = screen(leg, config)
-    delay_reasons, late_by = [], dict(clocks.late_clocks(inputs, locate_fixes(inputs, config)))
-    for clock, late in late_by.items():
+    delay_reasons, delays = [], dict(clocks.late_clocks(inputs, locate_fixes(inputs, config)))
+    for clock, delay_s in delays.items():
         slots = [slot for slot, source in INPUTS.items() if source.clock == clock]
-        by_ns = -round(late * 1e9)
+        shift_ns = -round(delay_s * 1e9)
         leg = leg.with_rows(**{
-            slot: clocks.shift_stamps(leg.rows(slot), by_ns, leg.imu) for slot in slots})
+            slot: clocks.shift_stamps(leg.rows(slot), shift_ns, leg.imu) for slot in slots})
         delay_reasons.append(Reason(
-            Code.DELAY_SEEN, f'{INPUTS[slots[0]].label} stamps are about {abs(late):.1f} s '
-            f'{"late" if late > 0 else "early"} relative to the IMU (estimated from the '
+            Code.DELAY_SEEN, f'{INPUTS[slots[0]].label} stamps are about {abs(delay_s):.1f} s '
+            f'{"late" if delay_s > 0 else "early"} relative to the IMU (estimated from the '
             'motion); the stamps were corrected',
             'Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with one clock.'))
     if delay_reasons:
         inputs, reasons = screen(leg, config)
-        inputs = replace(inputs, clock_delays=late_by)
+        inputs = replace(inputs, clock_delays=delays)
     return leg, inputs, (*delay_reasons, *reasons)
 
 
