@@ -11,7 +11,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import PREDICTED_REST_S
 from odocal_ros.forecast.progress import clock_difference_text
-from odocal_ros.live.session import Restored, SessionView, State
+from odocal_ros.live.session import RestoredResult, SessionView, State
 from odocal_ros.output.summary import sentence, values_in_words
 from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import cautions, Reason, Verdict
@@ -70,10 +70,11 @@ def provisional_answer(at_stop: SessionView) -> str:
         'result.*; call ~/stop_leg again to wait for it'])
 
 
-def restored_answer(result: Restored, unit: str, within_limits: str) -> tuple[bool, str]:
+def restored_answer(result: RestoredResult, unit: str, within_limits: str) -> tuple[bool, str]:
     """Return (success, text) of a restored result; ``unit`` is that of its scale."""
-    return result.valid, _sentences([f'no leg is running; {result.as_text(unit)}', within_limits,
-                                     'Next: drive a leg to update it'])
+    return result.is_valid, _sentences([
+        f'no leg is running; {result.as_text(unit)}', within_limits,
+        'Next: drive a leg to update it'])
 
 
 def _sentences(parts: Iterable[str]) -> str:
@@ -99,11 +100,11 @@ def hint(view: SessionView) -> str:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.has_open_leg else 'call ~/reset')
     if view.is_rejected_so_far:
-        return '; '.join([_fault_text(view), *view.missing[:1]])
-    if view.missing:
-        return view.missing[0]
-    if view.clocks:
-        return clock_difference_text(view.clocks)
+        return '; '.join([_fault_text(view), *view.missing_inputs[:1]])
+    if view.missing_inputs:
+        return view.missing_inputs[0]
+    if view.clock_differences:
+        return clock_difference_text(view.clock_differences)
     if state is State.RECORDING:
         actions, facts = _recording_hint(view)
         return '; '.join([*facts, *actions])
@@ -119,24 +120,24 @@ def hint(view: SessionView) -> str:
 
 def hint_action_first(view: SessionView) -> str:
     """Return the hint for a single line: in a leg the action comes before the estimate."""
-    has_problem = view.is_rejected_so_far or view.missing or view.clocks
+    has_problem = view.is_rejected_so_far or view.missing_inputs or view.clock_differences
     if view.session.state is State.RECORDING and not has_problem:
         actions, facts = _recording_hint(view)
         return '; '.join([*(actions or ['drive on']), *facts])
     return hint(view)
 
 
-def quantities_ok(view: SessionView) -> dict[str, str]:
-    """Return the quantities that meet their limits: of the current leg, else of the result."""
+def limit_checks(view: SessionView) -> dict[str, str]:
+    """Return quantity -> yes, no or unknown: its limit is met in the leg, else in the result."""
     session = view.session
     if session.state is State.RECORDING:
         return quantities.check_forecast(view.forecast, view.config, view.two_wheels,
                                          view.is_rejected_so_far)
     if session.state is not State.COMPUTING and session.calibration is not None:
         return quantities.check_calibration(session.calibration, view.config, view.two_wheels)
-    if session.state is not State.COMPUTING and session.restored is not None:
-        return quantities.check_estimates(session.restored.estimates, view.config,
-                                          view.two_wheels, session.restored.valid)
+    if session.state is not State.COMPUTING and session.restored_result is not None:
+        return quantities.check_estimates(session.restored_result.estimates, view.config,
+                                          view.two_wheels, session.restored_result.is_valid)
     return quantities.all_unknown()
 
 
@@ -186,10 +187,9 @@ def _recording_hint(view: SessionView) -> tuple[list[str], list[str]]:
     """Return the hint as two lists: actions, then facts."""
     metres, required = metres_to_go(view), manoeuvres(view)
     facts = list(map(str, view.faults[:1]))     # a caution, or a gap
-    is_slow = view.max_speed < view.leg.min_speed
-    if metres > 0 or is_slow:
+    if metres > 0 or view.max_speed < view.leg.min_speed:
         if metres > 0:
-            required = [f'drive {metres:.0f} m more',
+            required = [f'{DRIVE}{metres:.0f} m more',
                         *(text.removeprefix(DRIVE) for text in required)]
         end = _end_text(view) if view.session.is_automatic else DRIVE_ON
         return [', '.join(required), end], facts
@@ -229,16 +229,17 @@ def advice_after_result(view: SessionView) -> str:
         return f'drive {counted(missing_legs, "more leg")}'
     if warnings := cautions(reasons):
         return warnings[0].remedy
-    save = '' if config.output.autosave or view.saved else 'call ~/save, or '
+    save = '' if config.output.autosave or view.saved_folder else 'call ~/save, or '
     text = ('drive on: legs start and end automatically' if config.leg.automatic else
             f'{save}drive another leg for a smaller sigma')
-    return '; '.join([text, *_remedies(reasons, quantities_ok(view))])
+    return '; '.join([text, *_remedies(reasons, limit_checks(view))])
 
 
-def _remedies(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
+def _remedies(reasons: Sequence[Reason], checks: dict[str, str]) -> list[str]:
     """Return the remedies of the reasons about quantities that exceed their limits."""
-    labels = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
-              if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
+    # estimate -> label of its quantity
+    labels = {estimate: quantities.QUANTITIES[name].label for name, check in checks.items()
+              if check == quantities.NO for estimate in quantities.QUANTITIES[name].estimates}
     return list(dict.fromkeys(
         f'for the {labels[REASON_ESTIMATES[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'
         for r in reasons if REASON_ESTIMATES.get(r.code) in labels))

@@ -91,13 +91,13 @@ class Console:
         self._log_faults(view)
         for text in self._topics.new_texts(view.lost_messages, view.duplicate_publishers):
             self._log.warning(text)
-        if view.missing:
+        if view.missing_inputs:
             self._log_missing(view, steady_ns)
         else:
             self._log_complete(view)
 
     def _log_missing(self, view: SessionView, steady_ns: int) -> None:
-        text = NUMBER.sub('', '; '.join(view.missing))
+        text = NUMBER.sub('', '; '.join(view.missing_inputs))
         if self._missing_logged and text != self._missing_text:    # other publishers, other inputs
             self._pause_ns = MISSING_LOG_DELAY_NS
             self._due_ns = min(self._due_ns, steady_ns + MISSING_LOG_DELAY_NS)
@@ -105,7 +105,8 @@ class Console:
         if not self._due_ns:     # an input lost after the start is logged at once
             self._due_ns = steady_ns + (0 if self._ready_logged else MISSING_LOG_DELAY_NS)
         if steady_ns >= self._due_ns:
-            self._log.warning('waiting: ' * (not self._ready_logged) + '; '.join(view.missing))
+            state_text = '' if self._ready_logged else 'waiting: '
+            self._log.warning(state_text + '; '.join(view.missing_inputs))
             self._missing_logged = True
             self._pause_ns = min(2 * self._pause_ns, MAX_MISSING_LOG_INTERVAL_NS)
             self._due_ns = steady_ns + self._pause_ns

@@ -30,7 +30,7 @@ class Health:
         self.unreadable_count = 0    # messages that could not be read
         self.lost_count = 0          # messages missing in the middleware's sequence numbers
         self.lost_before_leg = 0     # ``lost_count`` at the start of the leg
-        self.gaps = 0          # steps of the stamps beyond the limit
+        self.gap_count = 0          # steps of the stamps beyond the limit
         self.has_no_stamps = False    # no stamp in the last messages
         self.last_arrival_ns = 0
         self.delay_s = 0.0     # send time minus stamp of the newest message
@@ -42,7 +42,7 @@ class Health:
     def reset_times(self) -> None:
         """Restart after a jump of time; counts of losses stay."""
         self.newest_ns = 0
-        self.jumped_back = False
+        self.has_jumped_back = False
         self._stamps_ahead: list[int] = []      # far ahead, not confirmed yet
         self._stale_rows = 0                    # far behind, at the end of the last block
         # count of messages and newest stamp after each block
@@ -104,7 +104,7 @@ class Health:
         rising = sorted(step * 1e-9 for step in steps if step > 0)
         if rising:
             limit = max_gap_s or 5 * self._interval_s
-            self.gaps += sum(step > limit for step in rising) if limit else 0
+            self.gap_count += sum(step > limit for step in rising) if limit else 0
             typical = rising[(len(rising) - 1) // 2]
             self._interval_s = 0.9 * self._interval_s + 0.1 * typical if self._interval_s \
                 else typical
@@ -131,7 +131,7 @@ class Health:
         if stale_rows < TIME_RESTART_ROWS if k else stale_rows + earlier_stale_rows < 2:
             self._stale_rows = stale_rows
             return before
-        self.jumped_back = True
+        self.has_jumped_back = True
         return stamps[-1]
 
     def silent_s(self, now_ns: int) -> float:

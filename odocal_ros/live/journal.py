@@ -18,7 +18,7 @@ from rclpy.serialization import serialize_message
 from odocal_ros import __version__
 from odocal_ros.bagio.segments import DROPPED_EVENTS, STATUS_TYPE
 from odocal_ros.live.journal_leg import JournalPlan
-from odocal_ros.live.journal_writer import JournalWriter, Received
+from odocal_ros.live.journal_writer import JournalWriter, ReceivedMessages
 from odocal_ros.live.messages import message_class
 from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.result_folders import output_root
@@ -49,15 +49,15 @@ class Journal:
         self._log, self._clock = node.get_logger(), node.get_clock()
         self._node, self._status_topic = node.get_fully_qualified_name(), status_topic
         self._writer = JournalWriter()
-        self._batch: dict[str, Received] = {}
-        self._marks: Received | None = None
+        self._batch: dict[str, ReceivedMessages] = {}
+        self._marks: ReceivedMessages | None = None      # statuses of the leg that are not written
         self._due_ns = 0                 # steady time of the next batch
         self._limit = 0                  # bytes of all journals; 0: no journal is written
         self._preroll_ns = 0             # duration of the messages kept for later legs
         self._leg_id = 0                 # of the leg whose journal is not joined yet, 0: none
         self._is_complete = False        # all samples of this leg have come
         self._last_event = ''            # event of its last stored status
-        self._dropped_legs: set[int] = set()     # reported as dropped
+        self._dropped_legs: set[int] = set()     # numbers of legs whose drop is stored
         self._logged_error = ''          # the error that was logged last
 
     @property
@@ -76,7 +76,7 @@ class Journal:
             return
         received = self._batch.get(source.slot)
         if received is None:
-            received = self._batch[source.slot] = Received(
+            received = self._batch[source.slot] = ReceivedMessages(
                 source.topic, source.msgtype, message_class(source.msgtype))
         received.raws += raws
         received.sent_ns += sent_ns
@@ -111,7 +111,7 @@ class Journal:
         batch, self._batch = self._batch, {}
         marks, self._marks = self._marks, None
         if batch or marks:
-            self._writer.submit(self._writer.take, batch, self._preroll_ns, marks)
+            self._writer.submit(self._writer.store, batch, self._preroll_ns, marks)
 
     def begin(self, session: Session, topics: dict[str, str]) -> None:
         """Open the journal of the leg that the session has just started."""
@@ -130,17 +130,17 @@ class Journal:
     def store_status(self, session: Session, array: DiagnosticArray) -> None:
         """Store a published status, by which a replay finds the marks of the leg."""
         leg_id, event = session.leg_id, session.event
-        dropped = event in DROPPED_EVENTS and leg_id not in self._dropped_legs
-        if event in DROPPED_EVENTS:
+        is_new_drop = event in DROPPED_EVENTS and leg_id not in self._dropped_legs
+        if is_new_drop:
             self._dropped_legs.add(leg_id)
-        if leg_id != self._leg_id and not dropped:
+        if leg_id != self._leg_id and not is_new_drop:
             return
         marks = self._marks if leg_id == self._leg_id else None
-        marks = marks or Received(self._status_topic, STATUS_TYPE, DiagnosticArray)
+        marks = marks or ReceivedMessages(self._status_topic, STATUS_TYPE, DiagnosticArray)
         marks.raws.append(serialize_message(array))
         marks.sent_ns.append(self._clock.now().nanoseconds)
         if leg_id != self._leg_id:      # of a journal that is closed
-            self._writer.submit(self._writer.add, leg_id, marks)
+            self._writer.submit(self._writer.add_mark, leg_id, marks)
             return
         self._marks = marks
         if event != self._last_event:

@@ -19,8 +19,8 @@ from odocal_ros.bagio.segments import JOURNAL, SegmentedBag
 from odocal_ros.safe_io.atomic_files import new_folder, PART, write_text
 
 JOURNAL_NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
-FOLDER_NEW_S = 10.0       # judgement: a node may still be about to write into a younger folder
-UNWRITTEN_BYTES = 64 * 2**20     # judgement: kept in memory while writing fails
+NEW_FOLDER_S = 10.0       # judgement: a node may still be about to write into a younger folder
+MAX_UNWRITTEN_BYTES = 64 * 2**20     # judgement: kept in memory while writing fails
 METADATA_BYTES = 2**20            # judgement: for metadata and file heads
 
 
@@ -40,10 +40,10 @@ def clear_empty(root: Path) -> None:
     for folder in list(root.iterdir()):
         with suppress(OSError):
             is_journal = JOURNAL_NAME.fullmatch(folder.name) and not folder.is_symlink()
-            is_old = is_journal and folder.stat().st_mtime < time.time() - FOLDER_NEW_S
+            is_old = is_journal and folder.stat().st_mtime < time.time() - NEW_FOLDER_S
             # these files never contain a message
             if is_old and all(path.name == JOURNAL or path.name.endswith(PART)
-                           for path in folder.iterdir()) and not _in_use(folder):
+                              for path in folder.iterdir()) and not _in_use(folder):
                 shutil.rmtree(folder)
 
 
@@ -103,8 +103,8 @@ class LegJournal:
     """
     Writes the journal of one leg; ``error`` is the cause while writing fails, else empty.
 
-    Chunks that cannot be written stay in memory for the next attempt. Above UNWRITTEN_BYTES the
-    journal ends with the data written so far, and the error stays.
+    Chunks that cannot be written stay in memory for the next attempt. Above MAX_UNWRITTEN_BYTES
+    the journal ends with the data written so far, and the error stays.
     """
 
     def __init__(self, plan: JournalPlan, channels: dict[int, Channel],
@@ -116,14 +116,14 @@ class LegJournal:
         self._bag: SegmentedBag | None = None
         self._lock: TextIO | None = None
         self._other_bytes = 0              # bytes of the other journals
-        self._is_closed = False       # given up, or finished
+        self._is_closed = False       # True: no more data are written
         self.late_marks: list[PackedChunk] = []      # after the end, not written yet
 
     @property
     def folder(self) -> str:
         return str(self._bag.folder) if self._bag else ''
 
-    def put(self, chunks: list[PackedChunk]) -> None:
+    def append(self, chunks: list[PackedChunk]) -> None:
         """Write chunks, after those that are not written yet."""
         if self._is_closed:
             return
@@ -131,13 +131,13 @@ class LegJournal:
         if self._unwritten:
             self._attempt(self._write)
         if self.error and not self._is_closed and sum(
-                chunk.size for chunk in self._unwritten) > UNWRITTEN_BYTES:
+                chunk.size for chunk in self._unwritten) > MAX_UNWRITTEN_BYTES:
             self._give_up(f'{self.error}; no further attempt in this leg')
 
     def finish(self) -> None:
         """Join the files to one complete bag."""
         if not self._is_closed:
-            self.put([])
+            self.append([])
             if self._bag is not None and not self._unwritten:
                 self._attempt(self._finish)
             elif self._bag is not None and not self._bag.segments:     # nothing was written
@@ -147,7 +147,7 @@ class LegJournal:
         if self._lock is not None:
             self._lock.close()
 
-    def add(self, chunks: list[PackedChunk]) -> None:
+    def add_mark(self, chunks: list[PackedChunk]) -> None:
         """Add a mark to the finished journal."""
         self.late_marks += chunks
         self.retry()

@@ -25,7 +25,7 @@ StampedChunks = deque[tuple[int, PackedChunk]]      # stamp of its last message,
 
 
 @dataclass
-class Received:
+class ReceivedMessages:
     """Raw messages of one topic since the last batch."""
 
     topic: str
@@ -85,8 +85,8 @@ class JournalWriter:
     def __init__(self) -> None:
         self.error = self.folder = ''
         self._channels: dict[int, Channel] = {}
-        self._numbers: dict[str, int] = {}            # topic -> channel
-        self._counts: dict[str, int] = {}             # topic -> messages packed
+        self._channel_numbers: dict[str, int] = {}    # by topic
+        self._message_counts: dict[str, int] = {}     # by topic, packed so far
         self._preroll = PreRoll()
         self._leg: LegJournal | None = None
         self._is_recording = False                    # samples of that leg continue
@@ -96,7 +96,7 @@ class JournalWriter:
         self._thread.start()
 
     def submit(self, job: Callable[..., None], *values: Any) -> None:
-        """Queue a call of one of the methods below."""
+        """Queue a call of one of the public methods below."""
         self._jobs.put((job, values))
 
     def close(self, grace_s: float) -> bool:
@@ -115,27 +115,29 @@ class JournalWriter:
                 self.error = ('internal error, please report it: '
                               f'{type(error).__name__}: {error}')
             else:
-                self._show()
+                self._update_state()
 
-    def _show(self) -> None:
+    def _update_state(self) -> None:
         if self._leg is not None:
             self.error, self.folder = self._leg.error, self._leg.folder
 
-    # jobs
-
-    def take(self, batch: dict[str, Received], preroll_ns: int, marks: Received | None) -> None:
+    def store(self, batch: dict[str, ReceivedMessages], preroll_ns: int,
+              marks: ReceivedMessages | None) -> None:
         """Pack a batch, keep it as pre-roll of later legs, and write it to the open leg."""
         chunks = []
         for slot, received in batch.items():
             chunk = self._packed(received)
             chunks.append(chunk)
-            self._preroll.feed(slot, received.newest_ns or received.sent_ns[-1], chunk, preroll_ns)
+            # without stamps, by the send time
+            newest_ns = received.newest_ns if received.newest_ns else received.sent_ns[-1]
+            self._preroll.feed(slot, newest_ns, chunk, preroll_ns)
         for leg in self._closed_legs.values():     # a mark that drops a leg must reach its journal
             if leg.late_marks:
                 leg.retry()
                 self.error = leg.error
         if self._leg is not None:
-            self._leg.put(chunks * self._is_recording + ([self._packed(marks)] if marks else []))
+            mark_chunks = [self._packed(marks)] if marks else []
+            self._leg.append(chunks * self._is_recording + mark_chunks)
 
     def restart(self) -> None:
         """Discard the pre-roll, after a jump of time."""
@@ -151,11 +153,10 @@ class JournalWriter:
         """Write only marks to the open leg from now on."""
         self._is_recording = False
 
-    def add(self, leg_id: int, marks: Received) -> None:
+    def add_mark(self, leg_id: int, marks: ReceivedMessages) -> None:
         """Add a mark to the journal of a leg that is closed."""
-        if leg_id in self._closed_legs:
-            leg = self._closed_legs[leg_id]
-            leg.add([self._packed(marks)])
+        if leg := self._closed_legs.get(leg_id):
+            leg.add_mark([self._packed(marks)])
             self.error = leg.error
 
     def finish(self) -> None:
@@ -163,17 +164,17 @@ class JournalWriter:
         leg = self._leg
         if leg is not None:
             leg.finish()
-            self._show()
+            self._update_state()
             self._closed_legs[leg.plan.leg_id] = leg
             self._leg = None
 
-    def _packed(self, received: Received) -> PackedChunk:
+    def _packed(self, received: ReceivedMessages) -> PackedChunk:
         """Return messages as a chunk of their channel, which is created with the first ones."""
-        number = self._numbers.get(received.topic)
+        number = self._channel_numbers.get(received.topic)
         if number is None:
-            number = self._numbers[received.topic] = len(self._numbers) + 1
+            number = self._channel_numbers[received.topic] = len(self._channel_numbers) + 1
             self._channels[number] = Channel(
                 received.topic, received.msgtype, definition=('msg', definition_of(received.kind)))
-        first = self._counts.get(received.topic, 0)
-        self._counts[received.topic] = first + len(received.raws)
+        first = self._message_counts.get(received.topic, 0)      # sequence number
+        self._message_counts[received.topic] = first + len(received.raws)
         return pack(number, received.sent_ns, received.raws, first)

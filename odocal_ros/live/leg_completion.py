@@ -39,13 +39,13 @@ LATE_TOPIC_S = 1.0   # judgement: longest wait for late topics at the stop mark
 
 
 class LegCompletion:
-    """Processes a leg. Nothing blocks: the worker computes, and ``tick`` handles its results."""
+    """Completes a leg. Nothing blocks: the worker computes, and ``tick`` handles its results."""
 
     def __init__(self, node: CheckedNode, recording: Recording, publishing: Publishing,
                  journal: Journal, config: Callable[[], Config]) -> None:
         """Use ``config()``, the configuration in force; a running leg keeps that of its start."""
         self.session = Session()
-        self.session.restored = restored_from(publishing.results())
+        self.session.restored_result = restored_from(publishing.results())
         self._recording, self._publishing, self._config = recording, publishing, config
         self._journal = journal
         self._log, self._clock = node.get_logger(), node.get_clock()
@@ -54,12 +54,14 @@ class LegCompletion:
         self._node_name = node.get_fully_qualified_name()
         self._active_job = worker.ActiveJob(self._worker, self._fail, self.show_status,
                                            node.context.ok)
-        self._observability: Observability | None = None  # of the leg last started
-        self._close_by_ns: int | None = None  # steady time until which a leg waits for its samples
-        self._snapshot: LegRecorder | None = None  # samples of the stopped leg, kept for a retry
-        self._view_at_stop: SessionView | None = None     # of the stopped leg
-        self._distance_m = 0.0                # of the leg that changed last
-        self._is_imu_silent = False              # in the recorded leg
+        self._observability: Observability | None = None      # of the leg last started
+        # steady time until which a stopped leg waits for its last samples
+        self._samples_until_ns: int | None = None
+        # of the stopped leg: samples, kept for a retry, and view before its stop mark
+        self._snapshot: LegRecorder | None = None
+        self._view_at_stop: SessionView | None = None
+        self._distance_m = 0.0           # of the leg that changed last
+        self._is_imu_silent = False      # in the recorded leg
         self._console = Console(self._log)
         self._saver = ResultSaver(self._worker, self._log, self.show_status, self._node_name)
 
@@ -78,7 +80,8 @@ class LegCompletion:
         self._stop_when_too_long()
         self._close_when_complete()
         if self._view_at_stop is not None and self.session.state is State.COMPUTING:
-            self._active_job.answer_late(partial(answers.provisional_answer, self._view_at_stop))
+            self._active_job.answer_expired(
+                partial(answers.provisional_answer, self._view_at_stop))
         if self.session.state is State.RECORDING:
             self._running_estimate.update(self._recording.newest_ns,
                                           self._recording.progress.distance_m())
@@ -97,16 +100,16 @@ class LegCompletion:
         forecast = self._running_estimate.forecast
         estimate = forecast.estimates.get('scale_factor') if forecast else None
         scale = estimate.value if estimate else None
-        self._recording.decode_new_messages(self._config(),
-                                            scale or self._publishing.scale_factor())
+        self._recording.decode_new_messages(
+            self._config(), self._publishing.scale_factor() if scale is None else scale)
 
     def close(self) -> bool:
         """Wait briefly for running jobs and files; return True if all are done."""
         self._running_estimate.end()
         grace_s = worker.FILES_GRACE_S if self._saver.is_busy else worker.JOB_GRACE_S
         until = time.monotonic() + grace_s
-        done = self._worker.close(until - time.monotonic())
-        return self._saver.close(max(0.0, until - time.monotonic())) and done
+        is_done = self._worker.close(grace_s)
+        return self._saver.close(max(0.0, until - time.monotonic())) and is_done
 
     def unstopped_leg_text(self) -> str:
         """Return the folder and replay command of a leg that was not stopped, else empty."""
@@ -122,7 +125,7 @@ class LegCompletion:
 
     def _restart_after_jump(self) -> None:
         jump = 'time jumped back (a bag restarted, or a clock was set)'
-        if self.session.state is State.RECORDING or self._close_by_ns is not None:
+        if self.session.state is State.RECORDING or self._samples_until_ns is not None:
             self._log.warning(f'{jump}: leg {self.session.leg_id} is cancelled')
             self._drop_leg(drop_cause='time jumped back')
             self._log.warning(self._dropped_leg_text())
@@ -145,28 +148,30 @@ class LegCompletion:
             forecast = self._view_at_stop.forecast
         config = session.config if session.is_busy else self._config()
         return SessionView(
-            session, config, missing=inputs.missing_reasons(config),
+            session, config, missing_inputs=inputs.missing_reasons(config),
             duplicate_publishers=inputs.duplicate_publishers(),
-            lost_messages=inputs.lost(), clocks=progress.clocks.find_differing(config),
-            rates_hz=recording.rates_hz(), results=self._publishing.results(),
-            restored=session.restored_since(), distance_m=self._distance_m,
+            lost_messages=inputs.lost_messages(), rates_hz=recording.rates_hz(),
+            clock_differences=progress.clocks.find_differing(config),
+            results=self._publishing.results(),
+            restored_stamp=session.restored_stamp(), distance_m=self._distance_m,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0,
             max_speed=progress.max_speed(), still_s=progress.still_s(),
             two_wheels=recording.two_wheels(),
             observability=self._observability if in_leg else None,
             forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             faults=self._running_estimate.faults(recording.imu_silent_s()) if in_leg else (),
-            stage=self._active_job.stage, saved=self._saver.saved, save_error=self._saver.error,
-            dropped_leg=self._dropped_leg_text(), journal=self._journal.folder,
-            journal_error=self._journal.error, has_received=recording.has_received(),
-            is_local=recording.is_local, has_imu=not inputs.without_imu)
+            stage=self._active_job.stage, dropped_leg=self._dropped_leg_text(),
+            saved_folder=self._saver.saved_folder, save_error=self._saver.error,
+            journal_folder=self._journal.folder, journal_error=self._journal.error,
+            has_received=recording.has_received(), is_local=recording.is_local,
+            has_imu=not inputs.without_imu)
 
     def show_status(self) -> None:
         view = self.view()
         self._console.report(view, time.monotonic_ns())
         self._journal.store_status(self.session, self._publishing.show_status(view))
 
-    def _mark_ns(self) -> int:
+    def _newest_stamp_ns(self) -> int:
         """Return the newest stamp of the IMU, or else of the odometer, on the sensors' clock."""
         self.decode_new_messages()
         return self._recording.newest_ns
@@ -207,25 +212,26 @@ class LegCompletion:
         return text
 
     def end_leg_now(self) -> None:
-        self._end_leg(self._mark_ns())
+        self._end_leg(self._newest_stamp_ns())
 
     def _end_leg(self, mark_ns: int) -> None:
         view = self.view()
-        self._view_at_stop = replace(
-            view, forecast=view.forecast and view.forecast.without_predictions())
+        if view.forecast is not None:
+            view = replace(view, forecast=view.forecast.without_predictions())
+        self._view_at_stop = view
         self.session.stop(mark_ns)
         self._running_estimate.end()
-        self._close_by_ns = time.monotonic_ns() + round(LATE_TOPIC_S * 1e9)
+        self._samples_until_ns = time.monotonic_ns() + round(LATE_TOPIC_S * 1e9)
         self.show_status()
         self._close_when_complete()
 
     def _close_when_complete(self) -> None:
         """Hand the leg to the worker once each topic has passed the stop mark, or time is up."""
-        if self._close_by_ns is None:
+        if self._samples_until_ns is None:
             return
-        if (time.monotonic_ns() > self._close_by_ns
+        if (time.monotonic_ns() > self._samples_until_ns
                 or self._recording.has_passed(self.session.stop_ns)):
-            self._close_by_ns = None
+            self._samples_until_ns = None
             self._journal.end()
             self._snapshot = self._recording.snapshot()
             self._compute(self._snapshot)
@@ -256,7 +262,7 @@ class LegCompletion:
             self._active_job.answer(False, text)
             return
         self.session.finish(leg.results, leg.calibration)
-        self.session.set_carried(leg.carried, leg.released)
+        self.session.set_carried(leg.carried, leg.released_count)
         success, text = self._publish_result(leg.calibration, leg.paths, leg.results)
         if success and self._config().output.autosave:
             self._save(leg.calibration)
@@ -267,7 +273,7 @@ class LegCompletion:
         self._publishing.show_paths(paths)
         view = self.view()
         success, text = answers.result_answer(calibration, parts, self.session.leg_id,
-                                              quantities_text(answers.quantities_ok(view)),
+                                              quantities_text(answers.limit_checks(view)),
                                               answers.advice_after_result(view))
         self._log.info(text)
         self._active_job.answer(success, text)
@@ -276,15 +282,15 @@ class LegCompletion:
     def _dropped_leg_text(self) -> str:
         """Return the text on a leg that was dropped automatically, empty without one."""
         session = self.session
-        return session.drop_cause and (
+        return '' if not session.drop_cause else (
             f'leg {session.leg_id} was cancelled: {session.drop_cause}; '
             f'{self._data_location(session.start_ns)}; call ~/start_leg for a new leg')
 
     def _drop_leg(self, text: str = '', drop_cause: str = '') -> None:
-        """Drop the open leg; text : answer for callers.   drop_cause : if automatic."""
+        """Drop the open leg; text : answer to callers.   drop_cause : '' if the operator asked."""
         self.session.cancel(drop_cause)
         self._running_estimate.end()
-        self._close_by_ns = self._snapshot = self._view_at_stop = None
+        self._samples_until_ns = self._snapshot = self._view_at_stop = None
         self._active_job.drop()
         self.show_status()
         self._journal.end()

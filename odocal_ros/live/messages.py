@@ -76,10 +76,10 @@ def _collect_texts(kind: Any, name: str, texts: dict[str, str]) -> None:
 
 
 def _msg_types(rclpy_type: str) -> tuple[str, str]:
-    """Return base type and type of a field in .msg: 'double[9]' is float64 and float64[9]."""
+    """Return base type and type of a field in .msg: of 'double[9]' float64 and float64[9]."""
     match = FIELD_TYPE.fullmatch(rclpy_type)
     if match is None:
-        raise ValueError(f'a field of type {rclpy_type}')
+        raise ValueError(f'{rclpy_type} is not a type of a message field')
     sequence, base, bound, max_length, _, count = match.groups()
     base = MSG_NAMES.get(base, base)
     text = base + (f'<={bound[1:-1]}' if bound else '')
@@ -89,7 +89,7 @@ def _msg_types(rclpy_type: str) -> tuple[str, str]:
 
 
 class Gate(MutuallyExclusiveCallbackGroup):
-    """Callback group that the executor skips while ``is_open`` is False: ``take`` reads then."""
+    """Callback group that the executor skips while ``is_open`` is False."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]

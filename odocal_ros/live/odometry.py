@@ -82,7 +82,7 @@ class OdometryNode(CheckedNode):
     def _build(self) -> None:
         self.config = params.declare_settings(self, ApplyConfig)
         calibration = params.declare_results(self, params.ODOMETRY_UNITS)
-        if calibration is None or not calibration.valid:
+        if calibration is None or not calibration.is_valid:
             refusal = 'no calibration is given' if calibration is None else (
                 f'the calibration of {calibration.stamp} was rejected')
             raise BadConfig(f'{refusal}: start with --ros-args --params-file FILE, a '
@@ -180,7 +180,7 @@ class OdometryNode(CheckedNode):
         for slot, rows in source.readings(raws, sent_ns) if raws else ():
             if slot != 'imu_other':
                 self._odometry.feed(slot, rows, source.reader.form if source.reader else None)
-        if source.health.jumped_back:
+        if source.health.has_jumped_back:
             source.health.reset_times()
 
     def _search_publishers(self, now_ns: int) -> None:

@@ -14,7 +14,7 @@ from odocal_ros.forecast.quantities import quantities_text
 from odocal_ros.live import answers, worker
 from odocal_ros.live.leg_completion import LegCompletion
 from odocal_ros.live.result_folders import LATEST, output_root
-from odocal_ros.live.session import Refused, State
+from odocal_ros.live.session import CommandRefused, State
 from odocal_ros.output.stored import Stored, stored_in
 from odocal_ros.output.value_text import counted, iso
 from odocal_ros.pipeline.automatic import LegSearch
@@ -128,30 +128,31 @@ class Operation(AutomaticLegs):
     """
     The commands of the node's services.
 
-    Each returns (success, text), or a future of it that ``tick`` completes; may raise Refused.
+    Each returns (success, text), or a future of it that ``tick`` completes, or raises
+    CommandRefused.
     """
 
     def start_leg(self) -> tuple[bool, str]:
-        session, mark_ns = self.session, self._mark_ns()
+        session, mark_ns = self.session, self._newest_stamp_ns()
         if session.state is State.RECORDING and not session.is_automatic:
             return True, (f'recording since {iso(session.start_ns)}, leg '
                           f'{session.leg_id}; {answers.hint(self.view())}')
         if reason := self._start_refusal():
-            raise Refused(f'no leg can be started: {reason}')
+            raise CommandRefused(f'no leg can be started: {reason}')
         if session.state is State.RECORDING:      # an automatic leg
             self._drop_leg(f'leg {session.leg_id} is replaced by a leg of the operator')
         return True, self._begin_leg(mark_ns)
 
     def mark(self) -> tuple[bool, str]:
         """Record a mark: the robot is on the next point of ``reference.points``."""
-        session, newest_ns = self.session, self._mark_ns()
+        session, newest_ns = self.session, self._newest_stamp_ns()
         if not self._config().reference.points:
-            raise Refused('reference.points is empty: set x and y of each point, and restart the '
-                          'node')
+            raise CommandRefused('reference.points is empty: set x and y of each point, and '
+                                 'restart the node')
         still_s = self._recording.progress.still_s()
         if session.state is State.RECORDING and still_s < MARK_STILL_S:
-            raise Refused(f'the wheels have stood for {still_s:.1f} s, required: '
-                          f'{MARK_STILL_S:g} s; stand on the point and call again')
+            raise CommandRefused(f'the wheels have stood for {still_s:.1f} s, required: '
+                                 f'{MARK_STILL_S:g} s; stand on the point and call again')
         delay_s = self._recording.inputs.leading_input.health.delay_s
         mark = session.mark(newest_ns - round(HALF_MARK * 1e9), newest_ns + round(delay_s * 1e9))
         self._recording.add_marks(mark_positions(session.config, [mark]), session.config)
@@ -177,17 +178,18 @@ class Operation(AutomaticLegs):
     def _last_result(self) -> tuple[bool, str]:
         session, view = self.session, self.view()
         if view.dropped_leg:
-            raise Refused(view.dropped_leg)
-        within_limits = quantities_text(answers.quantities_ok(view))
+            raise CommandRefused(view.dropped_leg)
+        within_limits = quantities_text(answers.limit_checks(view))
         if session.calibration is not None:
             success, text = answers.result_answer(session.calibration, within_limits=within_limits,
                                                   advice=answers.advice_after_result(view))
             return success, f'no leg is running; the last result: {text}'
-        if session.restored is not None:
+        if session.restored_result is not None:
             form = self._recording.inputs.form()
-            return answers.restored_answer(session.restored, form.scale_unit if form else '',
-                                           within_limits)
-        raise Refused('no leg is running and there is no result yet: call ~/start_leg first')
+            return answers.restored_answer(
+                session.restored_result, form.scale_unit if form else '', within_limits)
+        raise CommandRefused('no leg is running and there is no result yet: call ~/start_leg '
+                             'first')
 
     def cancel_leg(self) -> tuple[bool, str]:
         text = f'leg {self.session.leg_id} is cancelled'
@@ -210,8 +212,9 @@ class Operation(AutomaticLegs):
             return True, f'{text}; no leg is left'
 
         def handle(outcome: tuple[Calibration, worker.Paths]) -> None:
-            self.session.set_result(outcome[0])
-            self._publish_result(*outcome)
+            calibration, paths = outcome
+            self.session.set_result(calibration)
+            self._publish_result(calibration, paths)
 
         self._active_job.submit(
             partial(worker.recombine, remaining, self._config(), self.session.carried), handle)
@@ -233,6 +236,6 @@ class Operation(AutomaticLegs):
 
     def save(self) -> Future:
         if self.session.calibration is None:
-            raise Refused('nothing to save: no leg has been computed yet; call ~/start_leg, '
-                          'drive, ~/stop_leg')
+            raise CommandRefused('nothing to save: no leg has been computed yet; call '
+                                 '~/start_leg, drive, ~/stop_leg')
         return self._save(self.session.calibration, by_operator=True)

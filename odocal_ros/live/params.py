@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter
 
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.errors import BadConfig
-from odocal_ros.live.session import Restored
+from odocal_ros.live.session import RestoredResult
 from odocal_ros.output.stored import check_estimate
 from odocal_ros.reasons import Verdict
 from odocal_ros.safe_io.text_formats import one_line
@@ -39,8 +39,8 @@ ODOMETRY_UNITS = ESTIMATE_UNITS | {'scale_factor_as_sent': SCALE_UNIT} | {
     f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
     f'odometer_lever_arm_{axis}': 'm' for axis in 'xyz'}
 PREFIX = 'result.'
-# values that rclpy accepts for each policy in an override of QoS; none listed: a whole number
-QOS: dict[str, tuple[str, ...]] = {
+# format: values that rclpy accepts for each policy in an override of QoS; (): a whole number
+QOS_VALUES: dict[str, tuple[str, ...]] = {
     'reliability': ('reliable', 'best_effort', 'system_default', 'best_available'),
     'history': ('keep_last', 'keep_all', 'system_default'), 'depth': ()}
 UNKNOWN_DATE = 'an unknown date'
@@ -66,9 +66,9 @@ def descriptor(setting: Setting) -> msg.ParameterDescriptor:
     no type. Settings fixed at start-up are not declared read-only: the on-set callback refuses
     them with a remedy, rclpy without.
     """
-    about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
-    about += ' Fixed at start-up.' if setting.read_only else ''
-    result = msg.ParameterDescriptor(description=about)
+    text = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
+    text += ' Fixed at start-up.' if setting.read_only else ''
+    result = msg.ParameterDescriptor(description=text)
     result.dynamic_typing = setting.kind in ('floats', 'strs') and not (
         setting.read_only and setting.default)
     limits = []
@@ -92,9 +92,9 @@ def declare_settings(node: Node, kind: type = Config) -> Any:
     """Declare all settings, return the configuration; raise BadConfig for a wrong override."""
     values, settings = {}, settings_of(kind)
     for name, setting in settings.items():
-        # None for an empty list, which rclpy reads as bytes
-        listed = setting.kind in ('floats', 'strs')
-        default = list(setting.default) or None if listed else setting.default
+        default = setting.default
+        if setting.kind in ('floats', 'strs'):
+            default = list(default) or None      # None: rclpy reads an empty list as bytes
         try:
             value = node.declare_parameter(name, default, descriptor(setting)).value
             if value is None:
@@ -122,11 +122,11 @@ def check_qos(node: Node, topics: Iterable[str]) -> None:
     """Raise BadConfig for QoS overrides that rclpy refuses, but not before the subscription."""
     overrides = getattr(node, '_parameter_overrides', {})
     for topic in topics:
-        for policy, allowed in QOS.items():
+        for policy, allowed in QOS_VALUES.items():
             name = f'qos_overrides.{topic}.subscription.{policy}'
             value = overrides[name].value if name in overrides else None
-            number = policy == 'depth' and type(value) is int and 0 < value < 2**31
-            if value is not None and not number and value not in allowed:
+            is_depth = policy == 'depth' and type(value) is int and 0 < value < 2**31
+            if value is not None and not is_depth and value not in allowed:
                 requirement = (f'one of {", ".join(allowed)}' if allowed else
                                'a whole number above 0')
                 raise BadConfig(f'{name}: {value!r} is not {requirement}; correct the parameter '
@@ -156,35 +156,34 @@ def change_refusal(config: Config, results: dict[str, Any], parameters: list[Par
 def refuse_after_start(kind: type) -> Callable[[list[Parameter]], msg.SetParametersResult]:
     """Return the on-set callback of a node that reads its settings, a ``kind``, at start-up."""
     def refuse(parameters: list[Parameter]) -> msg.SetParametersResult:
-        own_parameters = [p.name for p in parameters
-                          if p.name.startswith(PREFIX) or p.name in settings_of(kind)]
-        return msg.SetParametersResult(successful=not own_parameters, reason=(
-            f'{own_parameters[0]} is only read at start-up: restart the node with it')
-            if own_parameters else '')
+        names = [p.name for p in parameters
+                 if p.name.startswith(PREFIX) or p.name in settings_of(kind)]
+        return msg.SetParametersResult(successful=not names, reason=(
+            f'{names[0]} is only read at start-up: restart the node with it') if names else '')
     return refuse
 
 
-def declare_results(node: Node, units: dict[str, str] = ESTIMATE_UNITS) -> Restored | None:
+def declare_results(node: Node, units: dict[str, str] = ESTIMATE_UNITS) -> RestoredResult | None:
     """Declare ``result.*``; return the result in overrides, if any; units : by estimate."""
     for name, default in _result_defaults(units).items():
         unit = units.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
-        about = msg.ParameterDescriptor(dynamic_typing=True, description=(
-            'Set by the node after each leg' + (f' [{unit}]' if unit else '')))
-        value = node.declare_parameter(name, default, about).value
+        value = node.declare_parameter(name, default, msg.ParameterDescriptor(
+            dynamic_typing=True, description=(
+                'Set by the node after each leg' + (f' [{unit}]' if unit else '')))).value
         kind = type(default)
         is_whole = kind is float and type(value) is int
         if type(value) is not kind and not is_whole:
             raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; {FILE_REMEDY}')
         if is_whole:
             node.set_parameters([Parameter(name, value=float(value))])
-    kept = restored_from({name: node.get_parameter(name).value
-                          for name in _result_defaults(units)}, units)
+    result = restored_from({name: node.get_parameter(name).value
+                            for name in _result_defaults(units)}, units)
     vehicle = node.get_parameter('vehicle').value
-    if kept is not None and kept.vehicle and vehicle and kept.vehicle != vehicle:
-        raise BadConfig(f"the result belongs to vehicle '{one_line(kept.vehicle)}', but this "
+    if result is not None and result.vehicle and vehicle and result.vehicle != vehicle:
+        raise BadConfig(f"the result belongs to vehicle '{one_line(result.vehicle)}', but this "
                         f"node to '{one_line(vehicle)}': give the calibration.yaml of this "
                         'vehicle, or none')
-    return kept
+    return result
 
 
 def result_values(calibration: Calibration, stamp: str, vehicle: str) -> dict[str, Any]:
@@ -200,14 +199,14 @@ def result_values(calibration: Calibration, stamp: str, vehicle: str) -> dict[st
 
 
 def restored_from(results: dict[str, Any],
-                  units: dict[str, str] = ESTIMATE_UNITS) -> Restored | None:
+                  units: dict[str, str] = ESTIMATE_UNITS) -> RestoredResult | None:
     """Return the result in ``result.*``, None without one; raise BadConfig if it is impossible."""
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
         raise BadConfig(f'result.legs is {legs}; it must be 0 or more; {FILE_REMEDY}')
     if one_line(stamp) != stamp:
         raise BadConfig(f"result.stamp: '{one_line(stamp)}' is not a date; {FILE_REMEDY}")
-    found = {}
+    estimates = {}
     for name, unit in units.items():
         value, sigma = (None if math.isnan(x) else x for x in (
             results[PREFIX + name], results[PREFIX + name + '_sigma']))
@@ -215,21 +214,20 @@ def restored_from(results: dict[str, Any],
             check_estimate(name, value, sigma)
         except ValueError as error:
             raise BadConfig(f'{error}; {FILE_REMEDY}') from None
-        found[name] = Estimate(value, sigma, '1' if unit == SCALE_UNIT else unit)
-    if all(e.value is None for e in found.values()):
+        estimates[name] = Estimate(value, sigma, '1' if unit == SCALE_UNIT else unit)
+    if all(estimate.value is None for estimate in estimates.values()):
         return None
-    return Restored(found, legs, results[PREFIX + 'valid'], stamp or UNKNOWN_DATE,
-                    results[PREFIX + 'vehicle'])
+    return RestoredResult(estimates, legs, results[PREFIX + 'valid'], stamp or UNKNOWN_DATE,
+                          results[PREFIX + 'vehicle'])
 
 
 def _python_value(value: Any) -> Any:
     """Return a parameter's value, an array as a tuple."""
-    if isinstance(value, (bool, int, float, str)) or value is None:
-        return value
-    return tuple(value)
+    return value if value is None or isinstance(value, int | float | str) else tuple(value)
 
 
 def _refusal(name: str, setting: Setting, error: Exception) -> str:
+    """Return the error of rclpy on an override as text, with the action."""
     text = ' '.join(str(error).split()).removesuffix(f': {name}').split('Reason: ')[-1]
     if setting.kind in ('float', 'floats') and isinstance(error, InvalidParameterTypeException):
         return f'{text}; write it as a decimal number such as 3.0'

@@ -30,7 +30,7 @@ from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import limit_kept_memory
 from odocal_ros.safe_io.text_formats import brief_line, error_text
 
-NAMESAKE_PERIOD_S = 5.0      # judgement: s between searches for another node of the same name
+NAME_CHECK_PERIOD_S = 5.0      # judgement: s between searches for another node of the same name
 
 
 class CheckedNode(Node):
@@ -43,7 +43,7 @@ class CheckedNode(Node):
             super().__init__(node_name or self.default_name, **kwargs)
             try:
                 self._build()
-                self._namesake_timer = self.steady_timer(NAMESAKE_PERIOD_S, self._check_namesakes)
+                self._name_timer = self.steady_timer(NAME_CHECK_PERIOD_S, self._check_name)
             except Exception:
                 self.destroy_node()  # type: ignore[no-untyped-call]
                 raise
@@ -60,11 +60,11 @@ class CheckedNode(Node):
     def spin(self, executor: Executor) -> None:
         executor.spin()
 
-    def _check_namesakes(self) -> None:
+    def _check_name(self) -> None:
         """Log once if another node has the same name."""
         own_name = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count(own_name) > 1:
-            self._namesake_timer.cancel()
+            self._name_timer.cancel()
             self.get_logger().warning(
                 f'another node is called {self.get_fully_qualified_name()}: services, parameters '
                 'and topics conflict; stop one, or rename it with -r __node:=NAME')
@@ -102,6 +102,11 @@ def run(kind: type[CheckedNode], about: str, args: list[str] | None = None) -> i
         text = error_text(error).split(', at /')[0]
         return print_error(name, f'{text}; write parameters as --ros-args -p name:=value, remaps '
                            'as -r from:=to')
+    return _spin(kind)
+
+
+def _spin(kind: type[CheckedNode]) -> int:
+    """Run a node until it must stop; return the exit code."""
     executor, node, code = SingleThreadedExecutor(), None, 0
     try:
         node = kind()
@@ -110,10 +115,10 @@ def run(kind: type[CheckedNode], about: str, args: list[str] | None = None) -> i
     except ExternalShutdownException:
         pass
     except OdocalError as error:
-        code = print_error(name, str(error))
+        code = print_error(kind.default_name, str(error))
     except Exception as error:
         # during a shutdown, the publisher of a callback may be destroyed already
-        code = print_error(name, error_text(error)) if rclpy.ok() else 0
+        code = print_error(kind.default_name, error_text(error)) if rclpy.ok() else 0
     finally:
         executor.shutdown()
         if node is not None:

@@ -36,17 +36,18 @@ from odocal_ros.settings.config import Config
 # causes for which an automatic leg is not used without a warning: short moves are not a fault
 SHORT_MOVE_CODES = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)
 # judgement: decimals of the values in the status; other values are published in full
-PLACES = dict.fromkeys((
+DECIMALS = dict.fromkeys((
     'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
     'distance_to_minimum_m', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
     'metres_to_go_yaw', 'computing_percent'), 1) | {
         'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
         'required_scale_sigma_ppm': 1, 'required_yaw_sigma_deg': 4, 'computing_change_sigmas': 4}
 # results of the status, and the unit in their keys
-UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad',
-         'scale_factor_left': '', 'scale_factor_right': '', 'track_width': '_m'}
-VALUES = {f'{name}{end}{unit}': f'result.{name}{end}'      # key: parameter
-          for name, unit in UNITS.items() for end in ('', '_sigma')}
+KEY_UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad',
+             'scale_factor_left': '', 'scale_factor_right': '', 'track_width': '_m'}
+RESULT_PARAMETERS = {      # by key
+    f'{name}{end}{unit}': f'result.{name}{end}'
+    for name, unit in KEY_UNITS.items() for end in ('', '_sigma')}
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
 # names of inputs in /diagnostics, if not those of the slots
 SLOT_NAMES = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
@@ -55,7 +56,7 @@ SLOT_NAMES = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 
 def calibration_status(view: SessionView) -> DiagnosticStatus:
     """Return the content of ``~/status``; docs/interface.md describes each key."""
     session, results = view.session, view.results
-    hint, checks = answers.hint(view), answers.quantities_ok(view)
+    hint, checks = answers.hint(view), answers.limit_checks(view)
     observability = view.observability
     reasons = view.faults if session.state is State.RECORDING else session.reasons
     stage = view.stage if session.state is State.COMPUTING else Stage()
@@ -67,11 +68,12 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'imu_rate_hz': view.rates_hz.get('imu', 0.0),
         'odometer_rate_hz': view.rates_hz.get('odometer', 0.0),
         'fix_rate_hz': view.rates_hz.get('fix', 0.0),
-    } | {key: results[name] for key, name in VALUES.items()} | _wheel_factors(view) | {
+    } | {key: results[name] for key, name in RESULT_PARAMETERS.items()} | _wheel_factors(view) | {
         'verdict': session.verdict(), 'hint': hint,
-        'legs': results['result.legs'] if view.restored else len(session.legs),
+        'legs': results['result.legs'] if view.restored_stamp else len(session.legs),
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
-        'restored': view.restored, 'standstill_s': view.still_s, 'max_speed_mps': view.max_speed,
+        'restored': view.restored_stamp, 'standstill_s': view.still_s,
+        'max_speed_mps': view.max_speed,
         'distance_to_minimum_m': answers.metres_to_go(view),
         'seconds_to_stand': answers.seconds_to_stand(view),
         'required_scale_sigma_ppm': view.config.verdict.max_scale_sigma * 1e6,
@@ -80,18 +82,19 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'observable': ', '.join(observability.observable) if observability else '',
         'not_observable': '; '.join(observability.not_observable) if observability else '',
         'messages_lost': sum(view.lost_messages.values()),
-        'missing': '; '.join(view.missing), 'reasons': ','.join(r.code.name for r in reasons),
-        'saved': view.saved, 'save_error': view.save_error, 'lost': view.dropped_leg,
-        'automatic': _automatic(view), 'unused': _unused(session),
+        'missing': '; '.join(view.missing_inputs),
+        'reasons': ','.join(reason.code.name for reason in reasons),
+        'saved': view.saved_folder, 'save_error': view.save_error, 'lost': view.dropped_leg,
+        'automatic': _automatic_text(view), 'unused': _unused_text(session),
         'carried_legs': session.carried.legs if session.carried else 0,
-        'journal': view.journal, 'journal_error': view.journal_error,
+        'journal': view.journal_folder, 'journal_error': view.journal_error,
         'computing_stage': stage.name, 'computing_passes': stage.passes,
         'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done,
     } | quantities.limit_keys(checks) | status_keys(view.forecast, view.forecast_age_s)
     return DiagnosticStatus(
         level=level(view), name=STATUS_NAME, message=sentence(view, hint, checks),
         hardware_id='odocal',
-        values=[KeyValue(key=k, value=_value_text(v, PLACES.get(k))) for k, v in keys.items()])
+        values=[KeyValue(key=k, value=_value_text(v, DECIMALS.get(k))) for k, v in keys.items()])
 
 
 def _wheel_factors(view: SessionView) -> dict[str, object]:
@@ -99,7 +102,7 @@ def _wheel_factors(view: SessionView) -> dict[str, object]:
     calibration = view.session.calibration
     estimates = calibration.estimates if calibration else {}
     return {f'{name}{end}': math.nan if value is None else value
-            for name in wheel_factors(estimates) if name not in VALUES
+            for name in wheel_factors(estimates) if name not in RESULT_PARAMETERS
             for end, value in (('', estimates[name].value), ('_sigma', estimates[name].sigma))}
 
 
@@ -124,9 +127,9 @@ def level(view: SessionView) -> Any:
     unused = view.session.unused_reason
     has_warning = (
         state is State.CALIBRATED and view.session.verdict() != Verdict.ACCEPTED.value
-        or view.missing or view.clocks or view.journal_error or view.save_error
-        or view.dropped_leg or view.faults or view.duplicate_publishers or _changes(view.session)
-        or unused and unused.code not in SHORT_MOVE_CODES)
+        or view.missing_inputs or view.clock_differences or view.journal_error or view.save_error
+        or view.dropped_leg or view.faults or view.duplicate_publishers
+        or _change_texts(view.session) or unused and unused.code not in SHORT_MOVE_CODES)
     return DiagnosticStatus.WARN if has_warning else DiagnosticStatus.OK
 
 
@@ -146,27 +149,28 @@ def sentence(view: SessionView, hint: str, checks: dict[str, str]) -> str:
         'rejected': 'Rejected',
         'failed': f'Failed: {session.failure}',
     }[view.state]
-    if view.restored and session.state is State.IDLE:
-        state_text += f', including the result restored from {view.restored}'
+    if view.restored_stamp and session.state is State.IDLE:
+        state_text += f', including the result restored from {view.restored_stamp}'
     within_limits = '' if session.state is State.RECORDING else quantities.quantities_text(checks)
     errors = [f'{statement}: {error}' for statement, error in (
         ('the result is not saved', view.save_error),
         ('the journal cannot be written', view.journal_error)) if error]
-    return '; '.join(filter(None, (state_text, *_changes(session), within_limits, view.dropped_leg,
-                                   hint, _unused(session), *view.duplicate_publishers,
-                                   losses_text(view.lost_messages), *errors)))
+    return '; '.join(filter(None, (
+        state_text, *_change_texts(session), within_limits, view.dropped_leg, hint,
+        _unused_text(session), *view.duplicate_publishers, losses_text(view.lost_messages),
+        *errors)))
 
 
-def _changes(session: Session) -> list[str]:
+def _change_texts(session: Session) -> list[str]:
     """Return the texts on changes of the scale between the legs."""
     return [r.text for r in session.reasons if r.code is Code.SCALE_CHANGED]
 
 
-def _unused(session: Session) -> str:
+def _unused_text(session: Session) -> str:
     return f'a leg was not used: {session.unused_reason}' if session.unused_reason else ''
 
 
-def _automatic(view: SessionView) -> str:
+def _automatic_text(view: SessionView) -> str:
     if not view.config.leg.automatic:
         return ''
     if view.session.state is not State.RECORDING:
@@ -182,7 +186,7 @@ def _value_text(value: object, places: int | None = None) -> str:
                 else round(float(value), places))
 
 
-def input_status(name: str, health: Health, missing_reason: str, needed: bool,
+def input_status(name: str, health: Health, missing_reason: str, is_needed: bool,
                  now_ns: int) -> DiagnosticStatus:
     """
     Return the health of one input for ``/diagnostics``.
@@ -192,7 +196,7 @@ def input_status(name: str, health: Health, missing_reason: str, needed: bool,
     """
     rate, silent = health.rate_hz(now_ns), health.silent_s(now_ns)
     if missing_reason:
-        status = DiagnosticStatus.ERROR if needed else DiagnosticStatus.WARN
+        status = DiagnosticStatus.ERROR if is_needed else DiagnosticStatus.WARN
         message = missing_reason
     elif health.fix_status is not None and health.fix_status < 0:
         status, message = DiagnosticStatus.WARN, f'no position: NavSatStatus {health.fix_status}'
@@ -204,7 +208,7 @@ def input_status(name: str, health: Health, missing_reason: str, needed: bool,
     # the first two have the names of diagnostic_updater, which monitors search for
     values = {'Events since startup': health.count, 'Actual frequency (Hz)': rate,
               'rate_hz': rate, 'age_s': silent if math.isfinite(silent) else -1.0,
-              'messages': health.count, 'gaps': health.gaps, 'dropped': health.lost_count,
+              'messages': health.count, 'gaps': health.gap_count, 'dropped': health.lost_count,
               'unreadable': health.unreadable_count, 'stamp_delay_s': health.delay_s}
     if health.fix_status is not None:
         values['fix_status'] = health.fix_status
@@ -278,12 +282,12 @@ class Publishing:
         node = self._node.get_fully_qualified_name()
         if not config.diagnostic_updater.use_fqn:
             node = node.lstrip('/')      # with its namespace, to separate vehicles
-        needed = recording.inputs.required(config)
+        required = recording.inputs.required(config)
         self._diagnostics.publish(self._array([
             input_status(f'{node}: {SLOT_NAMES.get(slot, slot)}', source.health,
-                         source.missing_reason(), source in needed, time.monotonic_ns())
+                         source.missing_reason(), source in required, time.monotonic_ns())
             for slot, source in recording.inputs.by_slot.items()
-            if source in needed or slot in recording.inputs.topics]))
+            if source in required or slot in recording.inputs.topics]))
 
     def _array(self, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
         array = DiagnosticArray(status=statuses)

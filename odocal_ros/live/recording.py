@@ -41,8 +41,8 @@ class Inputs:
             source.check(config)
         self._check_reference()
         for source in self.by_slot.values():
-            if len(source.allowed) == 1:  # one fixed type: errors are raised at the start
-                source.subscribe(source.allowed[0], config)
+            if len(source.allowed_types) == 1:  # one fixed type: errors are raised at the start
+                source.subscribe(source.allowed_types[0], config)
 
     def _check_reference(self) -> None:
         """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
@@ -94,7 +94,7 @@ class Inputs:
         for source in self.by_slot.values():
             source.health.lost_before_leg = source.health.lost_count
 
-    def lost(self) -> dict[str, int]:
+    def lost_messages(self) -> dict[str, int]:
         """Return topic -> messages lost since the last leg began, or since the start."""
         return {source.topic: source.health.lost_count - source.health.lost_before_leg
                 for source in self.by_slot.values()}
@@ -151,7 +151,7 @@ class Recording:
     def decode_new_messages(self, config: Config, known_scale: float) -> None:
         """Decode new messages; known_scale : scale factor for the distance, NaN without one."""
         fix = self.inputs.by_slot.get('fix')
-        static = fix.static if fix else None     # a TF reference has two topics
+        static = fix.static_transforms if fix else None     # a TF reference has two topics
         if static is not None:
             raws, sent_ns = static.take()
             if raws:
@@ -167,8 +167,8 @@ class Recording:
                 self.recorder.feed(slot, block)
                 if slot == 'imu_other':
                     continue
-                if not source.plausible.all():     # the recorder keeps all: the pipeline screens
-                    block = take(block, source.plausible)
+                if not source.is_plausible.all():   # the recorder keeps all: the pipeline screens
+                    block = take(block, source.is_plausible)
                 self._distribute(slot, block, config, known_scale)
             if not self.has_time_jumped:     # after a jump: no sample of an earlier leg
                 self._store_messages(source, raws, sent_ns)
@@ -225,7 +225,7 @@ class Recording:
 
     @property
     def has_time_jumped(self) -> bool:
-        return self._clock_jumped or self.inputs.leading_input.health.jumped_back
+        return self._clock_jumped or self.inputs.leading_input.health.has_jumped_back
 
     def restart(self) -> None:
         """Drop all samples, after a jump of time."""

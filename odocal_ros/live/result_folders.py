@@ -157,12 +157,12 @@ class ResultSaver:
     """
     Writes results into new folders by the worker, and answers with the folder or the error.
 
-    show : called when ``saved`` (the newest folder that is not withdrawn) or ``error`` (error of
-    the newest save) has changed.   node : full name, for the default folder.
+    show : called when ``saved_folder`` (the newest one that is not withdrawn) or ``error`` (of the
+    newest save) has changed.   node : full name, for the default folder.
     """
 
     def __init__(self, worker: Worker, log: PlainLog, show: Callable[[], None], node: str) -> None:
-        self.saved = self.error = ''
+        self.saved_folder = self.error = ''
         self._node = node
         self._worker, self._log, self._show = worker, log, show
         self._folders = ResultFolders()
@@ -186,7 +186,7 @@ class ResultSaver:
             self._saves_running -= 1
             if error is None:
                 folder, unchanged_reason = outcome
-                self.saved, self.error = str(folder), ''
+                self.saved_folder, self.error = str(folder), ''
                 if unchanged_reason and by_operator:
                     self._not_latest = calibration
                 text = f'saved to {folder}'
@@ -252,11 +252,11 @@ class ResultSaver:
         return self._report_worker.close(grace_s)
 
     def withdraw(self, since_ns: int) -> None:
-        """Move ``latest`` and ``saved`` back to the newest result of legs before ``since_ns``."""
+        """Move ``latest`` and ``saved_folder`` back to the newest result before ``since_ns``."""
         self.error = ''
 
         def on_done(folder: Path | None, error: Exception | None) -> None:
-            self.saved = '' if folder is None else str(folder)
+            self.saved_folder = '' if folder is None else str(folder)
             if error is not None:
                 self._log.warning(
                     'could not update `latest` after a leg was dropped; it still points to a '

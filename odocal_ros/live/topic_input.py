@@ -74,14 +74,14 @@ class Input:
     """
 
     def __init__(self, node: Node, slot: str, allowed: tuple[str, ...]) -> None:
-        self.slot, self.allowed = slot, allowed
+        self.slot, self.allowed_types = slot, allowed
         self.name = INPUTS[slot].topic
         self.topic = node.resolve_topic_name(self.name)
         self.msgtype = ''
         self.reader: Reader | None = None
         self.health = Health()
         self.error = ''      # why the topic or its last messages cannot be used
-        self.plausible = np.empty(0, bool)    # rows of the last block with a plausible stamp
+        self.is_plausible = np.empty(0, bool)    # rows of the last block with a plausible stamp
         self.frame = ''        # frame_id of the IMU's messages, once one has come
         self.publishers: list[TopicEndpointInfo] = []
         self.suggestions: list[str] = []     # suggested topics if this one has no publisher
@@ -91,13 +91,13 @@ class Input:
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
         self.queue = MessageQueue(node)
-        self.static: StaticTransforms | None = None     # second topic of a TF reference
+        self.static_transforms: StaticTransforms | None = None     # second topic of a TF reference
 
     def check(self, config: Config) -> None:
         """Raise OdocalError at start-up if the one allowed message type cannot be read."""
-        if len(self.allowed) == 1:
-            message_class(self.allowed[0])
-            make_reader(self.slot, self.allowed[0], config)
+        if len(self.allowed_types) == 1:
+            message_class(self.allowed_types[0])
+            make_reader(self.slot, self.allowed_types[0], config)
 
     def update_publishers(self) -> None:
         """Update clock and publishers, and without any the suggested topics."""
@@ -108,7 +108,7 @@ class Input:
 
     def _suggested_topics(self) -> list[str]:
         """Return published topics of a suitable type, the most similar name first."""
-        usable = set(self.allowed or TYPES)
+        usable = set(self.allowed_types or TYPES)
         own_topics = {p.topic_name for p in self._node.publishers}
         if self.slot == 'fix':      # most topics of these types contain the wheel odometry
             usable -= {'nav_msgs/msg/Odometry', TRANSFORMS}
@@ -117,7 +117,7 @@ class Input:
                  and self._node.count_publishers(name)]
         # many types can be an odometer: only topics with similar names
         return difflib.get_close_matches(self.topic, names, MAX_SUGGESTIONS,
-                                         0.0 if self.allowed else NAME_SIMILARITY)
+                                         0.0 if self.allowed_types else NAME_SIMILARITY)
 
     def duplicate_publishers(self) -> str:
         """Return a warning if the topic has several publishers or IMUs, else an empty text."""
@@ -142,7 +142,7 @@ class Input:
             return
         published = [p.topic_type for p in self.publishers[:1]]
         try:
-            for msgtype in self.allowed if len(self.allowed) == 1 else published:
+            for msgtype in self.allowed_types if len(self.allowed_types) == 1 else published:
                 self.subscribe(msgtype, config)
         except (OdocalError, ParameterException, InvalidQosOverridesError) as error:
             text = error_text(error)
@@ -152,9 +152,9 @@ class Input:
 
     def subscribe(self, msgtype: str, config: Config) -> None:
         """Create the reader and the subscription; raise OdocalError for a wrong type."""
-        if self.allowed and msgtype not in self.allowed:
-            raise BadData(f'{self.topic} carries {msgtype}, not {" or ".join(self.allowed)}: '
-                          f'remap {self.name} to another topic')
+        if self.allowed_types and msgtype not in self.allowed_types:
+            raise BadData(f'{self.topic} carries {msgtype}, required: '
+                          f'{" or ".join(self.allowed_types)}; remap {self.name} to another topic')
         kind = message_class(msgtype)
         reader = make_reader(self.slot, msgtype, config)
         self._configured_frame = config.imu.frame_id
@@ -172,7 +172,7 @@ class Input:
         self.queue.subscribe(kind, self.name, qos)
         self.reader, self.msgtype, self.error = reader, msgtype, ''
         if isinstance(reader, TransformReader):
-            self.static = StaticTransforms(self._node, self.topic, kind, reader.static)
+            self.static_transforms = StaticTransforms(self._node, self.topic, kind, reader.static)
         self._node.get_logger().info(
             f'{self.slot}: {msgtype} on {self.topic}, '
             f'{"reliable" if reliable else "best effort"}')
@@ -200,7 +200,7 @@ class Input:
         pairs = self._read(self.reader.rows if self.reader else None, raws, sent_ns)
         for slot, block in pairs:
             if slot == self.slot:
-                self.plausible = np.array(self.health.check_stamps(
+                self.is_plausible = np.array(self.health.check_stamps(
                     block.stamp_ns.tolist(), block.received_ns, max_gap_s), bool)
                 if isinstance(block, FixSamples) and len(block.status):
                     self.health.fix_status = int(block.status[-1])
@@ -270,7 +270,7 @@ class Input:
         if self.msgtype and self.msgtype not in types:
             return (f'{self.topic} is published as {", ".join(sorted(types))}; required: '
                     f'{self.msgtype}. Remap {self.name}'
-                    + ', or restart the node' * (len(self.allowed) != 1))
+                    + ', or restart the node' * (len(self.allowed_types) != 1))
         offers = ', '.join(sorted({QOS_NAMES.get(p.qos_profile.reliability, 'unknown QoS')
                                    for p in self.publishers}))
         publishers_text = counted(len(self.publishers), 'publisher')

@@ -56,7 +56,7 @@ class ComputedLeg:
     paths: Paths                           # of the longest part
     calibration: Calibration               # combination with all other legs
     carried: CarriedInformation | None     # of the legs that are no longer kept
-    released: int                          # number of kept legs, the oldest, added to it now
+    released_count: int                    # number of oldest kept legs that were added to it now
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,21 +83,21 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
         return UnusedLeg(results, reason)
     paths = leg_paths(max(results, key=lambda result: result.distance), config)
     max_legs = LEGS_WITH_TRACKS if is_automatic else MAX_OPERATOR_LEGS
-    released = max(0, len(kept_results) + 1 - max_legs)
+    released_count = max(0, len(kept_results) + 1 - max_legs)
     new_carried = add_to_carried(
-        [result for leg in kept_results[:released] for result in leg], config, carried)
+        [result for leg in kept_results[:released_count] for result in leg], config, carried)
     # results of the two-point method cannot be added to ``carried``: all legs are kept
     if new_carried is carried and not is_automatic:
-        released = 0
-    all_results = [*(result for leg in kept_results[released:] for result in leg), *results]
+        released_count = 0
+    all_results = [*(result for leg in kept_results[released_count:] for result in leg), *results]
     calibration = combine(all_results, config, new_carried, known_imu(config))
-    return ComputedLeg(results, paths, calibration, new_carried, released)
+    return ComputedLeg(results, paths, calibration, new_carried, released_count)
 
 
-def recombine(kept: list[LegResult], config: Config, carried: CarriedInformation | None = None,
-              ) -> tuple[Calibration, Paths]:
+def recombine(results: list[LegResult], config: Config,
+              carried: CarriedInformation | None = None) -> tuple[Calibration, Paths]:
     """Return the combination of the kept legs, at least one, and the paths of the last one."""
-    return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
+    return combine(results, config, carried, known_imu(config)), leg_paths(results[-1], config)
 
 
 def leg_paths(result: LegResult | None, config: Config) -> Paths:
@@ -231,7 +231,7 @@ class ActiveJob:
         self._token = None
 
     def create_future(self, patience_s: float = math.inf) -> Future:
-        """Return a future of (success, text), which ``answer`` or ``answer_late`` completes."""
+        """Return a future of (success, text), which ``answer`` or ``answer_expired`` completes."""
         future = Future()
         self._callers.append((future, time.monotonic() + patience_s))
         return future
@@ -242,7 +242,7 @@ class ActiveJob:
         for future, _ in callers:
             future.set_result((success, text))
 
-    def answer_late(self, text: Callable[[], str]) -> None:
+    def answer_expired(self, text: Callable[[], str]) -> None:
         """Answer the callers that have waited for their ``patience_s``; the job continues."""
         now = time.monotonic()
         expired = [future for future, until in self._callers if until <= now]

@@ -22,9 +22,9 @@ from odocal_ros.forecast.forecast import (
 )
 from odocal_ros.forecast.quantities import find_observable, Received, stated_variance
 from odocal_ros.live import answers
-from odocal_ros.live.answers import hint, manoeuvres, quantities_ok, seconds_to_stand, TURNS
+from odocal_ros.live.answers import hint, limit_checks, manoeuvres, seconds_to_stand, TURNS
 from odocal_ros.live.publishing import level
-from odocal_ros.live.session import Restored, Session, SessionView
+from odocal_ros.live.session import RestoredResult, Session, SessionView
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
 
@@ -121,22 +121,22 @@ def recording(**known):
 
 def test_quantities_are_from_the_forecast_or_result_of_the_state():
     now = recording(forecast=Forecast(GOOD, NO_YAW))
-    assert quantities_ok(now)['scale'] == 'yes'
+    assert limit_checks(now)['scale'] == 'yes'
     session = now.session
     session.stop(2)
-    assert set(quantities_ok(now).values()) == {'unknown'}
+    assert set(limit_checks(now).values()) == {'unknown'}
     session.finish(None, result())
-    assert set(quantities_ok(now).values()) == {'yes'}
+    assert set(limit_checks(now).values()) == {'yes'}
     session.start(3, CONFIG)
-    assert set(quantities_ok(replace(now, forecast=None)).values()) == {'unknown'}
+    assert set(limit_checks(replace(now, forecast=None)).values()) == {'unknown'}
     session.cancel()
-    assert set(quantities_ok(now).values()) == {'yes'}
+    assert set(limit_checks(now).values()) == {'yes'}
     fresh = SessionView(Session(), CONFIG)
-    assert set(quantities_ok(fresh).values()) == {'unknown'}
-    fresh.session.restored = Restored(WHOLE, 2, True, '2026-01-02T03:04:05Z')
-    assert quantities_ok(fresh)['scale'] == 'yes'
-    fresh.session.restored = Restored(WHOLE, 2, False, '2026-01-02T03:04:05Z')
-    assert quantities_ok(fresh)['scale'] == 'no'
+    assert set(limit_checks(fresh).values()) == {'unknown'}
+    fresh.session.restored_result = RestoredResult(WHOLE, 2, True, '2026-01-02T03:04:05Z')
+    assert limit_checks(fresh)['scale'] == 'yes'
+    fresh.session.restored_result = RestoredResult(WHOLE, 2, False, '2026-01-02T03:04:05Z')
+    assert limit_checks(fresh)['scale'] == 'no'
 
 
 # driving instructions
@@ -167,11 +167,12 @@ def test_a_configured_width_or_the_mean_of_both_requires_no_turns():
 def test_the_hint_states_first_that_a_leg_would_be_rejected():
     enough = Forecast(GOOD, YAW, 0.001)
     dead = (Reason(Code.WHEEL_DEAD, 'the left'),)
-    now = recording(forecast=enough, distance_m=500.0, faults=dead, missing=['no IMU for 3 s'])
+    now = recording(forecast=enough, distance_m=500.0, faults=dead,
+                    missing_inputs=['no IMU for 3 s'])
     assert hint(now).startswith('call ~/cancel_leg and start again: the leg would be rejected: '
                                 'WHEEL_DEAD: the left. Check the sensor')
     assert hint(now).endswith('; no IMU for 3 s')
-    assert set(quantities_ok(now).values()) == {'no', 'unknown'}
+    assert set(limit_checks(now).values()) == {'no', 'unknown'}
     assert (level(now), level(recording(forecast=enough))) == (b'\x02', b'\x00')
     # a caution does not require another drive: it is stated before the usual hint
     uncertainty = (Reason(Code.COUNTER_RESET, 'by -70'),)
@@ -260,7 +261,7 @@ def test_a_response_has_values_quantities_reasons_and_the_next_action():
 
 
 def test_a_restored_result_is_stated_as_restored():
-    kept = Restored(estimates(scale_factor=1e-4, yaw_mounting_angle=None), 2, True,
+    kept = RestoredResult(estimates(scale_factor=1e-4, yaw_mounting_angle=None), 2, True,
                     '2026-01-02T03:04:05Z')
     success, text = answers.restored_answer(kept, 'm/pulse', 'OK: scale')
     assert success
@@ -268,6 +269,6 @@ def test_a_restored_result_is_stated_as_restored():
         'no leg is running; restored result of 2026-01-02T03:04:05Z: scale factor 1.00000 ± '
         '0.00010 m/pulse (1.00000 ± 0.00010 pulses/m), yaw mounting not determined, pitch '
         'mounting not determined; from 2 legs. OK: scale. Next: drive a leg to update it')
-    success, text = answers.restored_answer(replace(kept, valid=False), '', '')
+    success, text = answers.restored_answer(replace(kept, is_valid=False), '', '')
     assert not success
     assert 'which was rejected' in text

@@ -55,22 +55,22 @@ def test_the_rate_follows_from_stamps_and_the_silence_limit_from_the_rate():
 def test_lost_messages_and_gaps_are_counted_but_not_between_two_publishers():
     assert health_of(arrived=[[5, 6, 9], [10, 12]]).lost_count == 3       # 7, 8 and 11
     assert health_of(arrived=[[5, 900, 6, 901], [1, 2]]).lost_count == 0
-    assert health_of([1.0, 1.01, 1.6], max_gap_s=0.5).gaps == 1
+    assert health_of([1.0, 1.01, 1.6], max_gap_s=0.5).gap_count == 1
     # 0.54 s exceeds 5 intervals of 0.1 s, 0.45 s does not
-    assert health_of(np.arange(1, 2, 0.1), [2.0, 2.45, 2.99]).gaps == 1
+    assert health_of(np.arange(1, 2, 0.1), [2.0, 2.45, 2.99]).gap_count == 1
 
 
 def test_a_block_of_old_stamps_is_a_time_jump_but_a_single_one_is_not():
     health = health_of([10.0, 10.1], [3.0, 10.2])
-    assert not health.jumped_back
+    assert not health.has_jumped_back
     decoded(health, rows([2.0, 2.1]))
-    assert health.jumped_back
+    assert health.has_jumped_back
     health.reset_times()
     decoded(health, rows([2.2]))
-    assert (health.jumped_back, health.newest_ns) == (False, int(2.2 * SECOND))
+    assert (health.has_jumped_back, health.newest_ns) == (False, int(2.2 * SECOND))
     stamps = [*np.arange(20.0, 21.0, 0.1), *np.arange(5.0, 6.0, 0.1)]
     for cut in range(1, len(stamps)):
-        assert health_of([19.9], stamps[:cut], stamps[cut:]).jumped_back, cut
+        assert health_of([19.9], stamps[:cut], stamps[cut:]).has_jumped_back, cut
 
 
 @pytest.mark.parametrize('rows_at_once', [1, 3, 20])
@@ -89,22 +89,22 @@ def test_single_wrong_stamps_are_ignored_for_any_block_size(rows_at_once, wild):
                 travel.feed(take(part, sound), 0.02)
             assert 0 <= travel.still_s() < 4
             assert abs(health.newest_ns * 1e-9 - 1e6 - 22) < 3
-        assert not health.jumped_back, at
+        assert not health.has_jumped_back, at
         assert travel.still_s() == pytest.approx(3.9, abs=0.25)     # wrong stamps at the ends
 
 
 @pytest.mark.parametrize('rows_behind', [1, 2])
 def test_an_old_stamp_after_a_pause_is_ignored(rows_behind):
     health = health_of([1000.0, 1000.1], [1000.2, 1002.0, *[1.0] * rows_behind])
-    assert (health.newest_ns, health.jumped_back) == (1002 * SECOND, False)
+    assert (health.newest_ns, health.has_jumped_back) == (1002 * SECOND, False)
     decoded(health, rows([1002.1, 1002.2]))
-    assert (health.newest_ns * 1e-9, health.jumped_back) == (pytest.approx(1002.2), False)
+    assert (health.newest_ns * 1e-9, health.has_jumped_back) == (pytest.approx(1002.2), False)
 
 
 @pytest.mark.parametrize('before', [[], [10.0, 10.1]])
 def test_a_stamp_seconds_ahead_within_a_block_is_ignored(before):
     health = health_of([*before, 20.0, 10.2, 10.3, 10.4])
-    assert (health.newest_ns * 1e-9, health.jumped_back) == (pytest.approx(10.4), False)
+    assert (health.newest_ns * 1e-9, health.has_jumped_back) == (pytest.approx(10.4), False)
 
 
 def test_stamps_far_ahead_are_accepted_if_the_next_ones_continue_them():
@@ -112,7 +112,7 @@ def test_stamps_far_ahead_are_accepted_if_the_next_ones_continue_them():
     assert decoded(health, rows([1e5])).tolist() == [False]
     assert decoded(health, rows([1e5 + 1, 1e5 + 2])).tolist() == [False, True]
     assert health.newest_ns == int((1e5 + 2) * SECOND)
-    assert not health.jumped_back
+    assert not health.has_jumped_back
 
 
 def test_after_a_time_jump_stamps_are_not_reported_as_zero():

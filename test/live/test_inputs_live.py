@@ -32,7 +32,7 @@ def test_the_hint_gives_the_reason_for_waiting(start, connect):
     client.node.create_publisher(Image, 'odometer', 1)
     wait_for(lambda: 'sensor_msgs/msg/Image' in client.status['missing'], 'the foreign type')
     client.node.create_publisher(Image, 'fix', 1)
-    foreign = '/fix carries sensor_msgs/msg/Image, not sensor_msgs/msg/NavSatFix or '
+    foreign = '/fix carries sensor_msgs/msg/Image, required: sensor_msgs/msg/NavSatFix or '
     wait_for(lambda: foreign in client.status['missing'], 'the foreign type of the fix')
 
 

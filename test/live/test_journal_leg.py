@@ -32,11 +32,11 @@ def driven(root):
     one = journal(root)
     logged = []
     for k in range(CHUNKS):
-        one.put([chunk(k)])
+        one.append([chunk(k)])
         logged.append(one.error)
     one.finish()
     logged.append(one.error)
-    one.add([chunk(CHUNKS)])
+    one.add_mark([chunk(CHUNKS)])
     return one, [*logged, one.error]
 
 
@@ -114,15 +114,15 @@ def test_a_permanently_failing_disk_keeps_what_was_written_before(tmp_path, monk
 def test_a_missing_folder_is_reported_and_used_again_when_it_is_back(tmp_path, where):
     root = tmp_path / 'journal'
     one = journal(root)
-    one.put([chunk(0)])
+    one.append([chunk(0)])
     folder = root if where == 'root' else root / NAME
     away = tmp_path / 'away'
     folder.rename(away)
-    one.put([chunk(1)])
+    one.append([chunk(1)])
     assert 'No such file or directory' in one.error
     assert NAME in one.error
     away.rename(folder)
-    one.put([chunk(2)])
+    one.append([chunk(2)])
     assert one.error == ''
     one.finish()
     assert times(one.folder) == times_of(*range(3))
@@ -132,7 +132,7 @@ def test_two_nodes_with_one_folder_write_separate_journals(tmp_path):
     both = [journal(tmp_path) for _ in range(2)]
     for k in range(CHUNKS):
         for n, one in enumerate(both):
-            one.put([chunk(10 * n + k)])
+            one.append([chunk(10 * n + k)])
     for one in both:
         one.finish()
         assert one.error == ''
@@ -197,7 +197,7 @@ def test_all_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
     for leg_id in range(1, 5):
         one = journal(tmp_path, f'leg_{leg_id}', limit)
         for k in range(5):
-            one.put([large(k)])
+            one.append([large(k)])
         one.finish()
         assert one.error == ''
     assert len(taken) == 4 * (5 + 1 + 1)
@@ -210,7 +210,7 @@ def test_a_leg_larger_than_the_limit_is_kept_up_to_the_limit(tmp_path, monkeypat
     folder_of(tmp_path, 'old', 1000, 1)
     one = journal(tmp_path, limit=500_000)
     for k in range(20):
-        one.put([large(k)])
+        one.append([large(k)])
     assert 'raise journal.max_bytes' in one.error
     one.finish()
     folder, = journal_leg.journal_folders(tmp_path)
@@ -222,16 +222,16 @@ def test_a_leg_larger_than_the_limit_is_kept_up_to_the_limit(tmp_path, monkeypat
 
 
 def test_unwritten_data_waits_in_memory_up_to_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'UNWRITTEN_BYTES', 350_000)
+    monkeypatch.setattr(journal_leg, 'MAX_UNWRITTEN_BYTES', 350_000)
     one = journal(tmp_path)
-    one.put([large(0)])
+    one.append([large(0)])
     with monkeypatch.context() as patch:
         Refusing(1, for_ever=True).put_in(patch)
         for k in range(1, 6):
-            one.put([large(k)])
+            one.append([large(k)])
     assert 'no further attempt in this leg' in one.error
     assert not one._unwritten
-    one.put([large(6)])                # an early end is better than a gap
+    one.append([large(6)])                # an early end is better than a gap
     one.finish()
     with open_bag(one.folder) as bag:
         assert bag.topics['/odometer'].count == 1

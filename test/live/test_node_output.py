@@ -179,14 +179,14 @@ def test_each_message_is_printed_once_or_at_growing_intervals():
         console.report(SessionView(session, Config(), **known), second * SECOND)
         return hint_text[before:]
 
-    nothing = {'missing': ['no IMU on /imu/data']}
+    nothing = {'missing_inputs': ['no IMU on /imu/data']}
     times = [s for s in range(-20000, 280) if report(s, **nothing)]
     assert [t + 20000 for t in times[:4]] == [5, 15, 35, 75]       # 5 s, then growing intervals
     assert max(b - a for a, b in zip(times, times[1:], strict=False)) == 3600
     # another missing input is printed soon; the duration of a silence is not a change
-    other = {'missing': ['no IMU on /imu/data for 3 s: 1 publisher found']}
+    other = {'missing_inputs': ['no IMU on /imu/data for 3 s: 1 publisher found']}
     assert [s for s in range(280, 290) if report(s, **other)] == [285]
-    assert report(290, missing=['no IMU on /imu/data for 9 s: 1 publisher found']) == []
+    assert report(290, missing_inputs=['no IMU on /imu/data for 9 s: 1 publisher found']) == []
     assert report(300, rates_hz={'imu': 100.0})[0] == (
         'info', 'ready (imu 100 Hz): stand still for 10 s, then call ~/start_leg')
     assert report(301) == []

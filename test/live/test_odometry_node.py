@@ -23,7 +23,7 @@ from odocal_ros.live.odometry import transform_of
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.output.files import as_json
-from odocal_ros.output.program_files import texts
+from odocal_ros.output.program_files import file_texts
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.settings.node_configs import OdomFrames
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -67,7 +67,7 @@ def replayed(drive, tmp_path_factory):
     calibration = combine([result], config)
     path = tmp_path_factory.mktemp('calibrated') / 'calibration.yaml'
     content = as_json(calibration, config, [], '2026-01-02T03:04:05+00:00')
-    path.write_text(texts(calibration, config, content)['calibration.yaml'])
+    path.write_text(file_texts(calibration, config, content)['calibration.yaml'])
     return SimpleNamespace(row=row, alignment=alignment, result=result, path=path)
 
 

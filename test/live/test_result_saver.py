@@ -49,7 +49,7 @@ def save(saving, tmp_path):
     def run(calibration, by_operator=True):
         success, text = saving.save(calibration, tmp_path, by_operator)
         assert success
-        saved = saving.saver.saved
+        saved = saving.saver.saved_folder
         assert saved in text
         return text, (tmp_path / 'latest').resolve().name == saved.rpartition('/')[2]
     return run

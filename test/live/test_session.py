@@ -12,7 +12,7 @@ import pytest
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.live import worker
-from odocal_ros.live.session import LEGS_WITH_TRACKS, Refused, Session, State
+from odocal_ros.live.session import CommandRefused, LEGS_WITH_TRACKS, Session, State
 from odocal_ros.output.files import as_json
 from odocal_ros.output.program_files import geojson
 from odocal_ros.output.report import report_html
@@ -65,7 +65,7 @@ def test_a_failed_leg_is_kept_until_a_retry_or_a_cancellation():
     session.stop(60)
     session.fail('no memory')
     assert (session.state, session.has_open_leg, session.is_busy) == (State.FAILED, True, False)
-    with pytest.raises(Refused, match='leg 2 failed and is kept.*~/stop_leg.*~/cancel_leg'):
+    with pytest.raises(CommandRefused, match='leg 2 failed and is kept.*~/stop_leg.*~/cancel_leg'):
         session.start(70, CONFIG)
     session.retry(CONFIG)
     assert session.state is State.COMPUTING
@@ -89,9 +89,9 @@ def test_undo_removes_the_last_leg_and_shows_its_marks():
     assert (session.leg_id, session.start_ns, session.stop_ns) == (2, 11, 15)
     assert (session.event, session.state) == ('undone', State.COMPUTING)
     # no start and no cancel while it is computed
-    with pytest.raises(Refused, match='is being computed'):
+    with pytest.raises(CommandRefused, match='is being computed'):
         session.start(90, CONFIG)
-    with pytest.raises(Refused, match='no leg is running'):
+    with pytest.raises(CommandRefused, match='no leg is running'):
         session.cancel()
     session.set_result(calibration(Code.LEG_TOO_SHORT))
     assert session.state is State.REJECTED
@@ -113,7 +113,7 @@ def test_a_reset_drops_all_legs_and_the_carried_result():
     (lambda s: s.cancel(), 'no leg is running'),
     (lambda s: s.begin_undo(), 'no leg to undo')])
 def test_an_idle_session_refuses(command, words):
-    with pytest.raises(Refused, match=words):
+    with pytest.raises(CommandRefused, match=words):
         command(Session())
 
 
@@ -121,7 +121,8 @@ def test_an_idle_session_refuses(command, words):
 def test_an_open_leg_must_be_ended_first(command):
     session = with_legs(1)
     session.start(50, CONFIG)
-    with pytest.raises(Refused, match='leg 2 is open: end it with ~/stop_leg or ~/cancel_leg'):
+    with pytest.raises(CommandRefused,
+                       match='leg 2 is open: end it with ~/stop_leg or ~/cancel_leg'):
         command(session)
 
 
@@ -176,7 +177,7 @@ def test_released_legs_remain_in_the_result(town, monkeypatch):
         return worker.compute(SimpleNamespace(close=lambda *_: None), 0, 1,
                               [(one,) for one in every[:-1]], config)
     done = computed()
-    assert done.released == 1
+    assert done.released_count == 1
     assert done.carried.legs == 1
     assert done.calibration.legs == tuple(every[1:])
     for name, expected in combine(every, config).estimates.items():
@@ -187,5 +188,5 @@ def test_released_legs_remain_in_the_result(town, monkeypatch):
     for one in every:      # two-point results have no information to carry over
         del one.methods['smoother']
     done = computed()
-    assert (done.released, done.carried) == (0, None)
+    assert (done.released_count, done.carried) == (0, None)
     assert done.calibration.legs == tuple(every)
