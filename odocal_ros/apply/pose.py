@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 import struct
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,11 @@ TWIST_OFFSET = 43 * 8     # format: bytes before the twist
 ZEROS = (0.0,) * 6      # definition
 
 
+def _floats(start: int, stop: int, *shape: int) -> Any:
+    """Return a property for some of the floats of a pose, with a shape."""
+    return property(lambda pose: pose.numbers[start:stop].reshape(*shape))
+
+
 @dataclass(frozen=True, eq=False)
 class Pose:
     """
@@ -37,41 +43,17 @@ class Pose:
 
     stamp_ns: int
     raw: bytes
+    position = _floats(0, 3, 3)            # m, of base_link in odom
+    q = _floats(3, 7, 4)                   # attitude of base_link in odom, x y z w
+    pose_cov = _floats(7, 43, 6, 6)        # of position and rotation about the axes of odom
+    velocity = _floats(43, 46, 3)          # m/s, of base_link in base_link
+    rate = _floats(46, 49, 3)              # rad/s, turn rate of base_link in base_link
+    twist_cov = _floats(49, 85, 6, 6)      # of velocity and rate
 
     @property
     def numbers(self) -> Floats:
-        """Return the floats: (85,)."""
+        """Return all floats, (85,)."""
         return np.frombuffer(self.raw)
-
-    @property
-    def position(self) -> Floats:
-        """Return the position of base_link in odom, m: (3,)."""
-        return self.numbers[:3]
-
-    @property
-    def q(self) -> Floats:
-        """Return the attitude of base_link in odom, x y z w: (4,)."""
-        return self.numbers[3:7]
-
-    @property
-    def pose_cov(self) -> Floats:
-        """Return the covariance of position and rotation about the axes of odom: (6, 6)."""
-        return self.numbers[7:43].reshape(6, 6)
-
-    @property
-    def velocity(self) -> Floats:
-        """Return the velocity of base_link in base_link, m/s: (3,)."""
-        return self.numbers[43:46]
-
-    @property
-    def rate(self) -> Floats:
-        """Return the turn rate of base_link in base_link, rad/s: (3,)."""
-        return self.numbers[46:49]
-
-    @property
-    def twist_cov(self) -> Floats:
-        """Return the covariance of velocity and rate: (6, 6)."""
-        return self.numbers[49:].reshape(6, 6)
 
     def is_valid(self) -> bool:
         """Return True if all values are finite and no variance is negative."""

@@ -3,8 +3,7 @@
 
 """Values of a vehicle for dead reckoning: from its calibration, or assumed with a text on it."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
@@ -22,7 +21,7 @@ UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05
 WHEEL_SCALES = ('scale_factor_left', 'scale_factor_right')
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Vehicle:
     """A calibrated vehicle; frame v: forward, left, up; frame b: that of the IMU."""
 
@@ -36,36 +35,24 @@ class Vehicle:
     lever_arm: Floats       # (3,) m, position of the odometer in base_link
     gyro_bias: Floats | None      # (3,) rad/s in b as last calibrated, None: unknown
     assumptions: tuple[str, ...] = ()      # texts on values that are not in the calibration
+    forward_b: Floats = field(init=False)      # (3,) forward axis of the vehicle
+    C_vb: Floats = field(init=False)           # (3, 3) rotation from b to v
+    q_bv: Floats = field(init=False)           # (4,) attitude of v in b, x y z w
+    arm_b: Floats = field(init=False)          # (3,) m, from the odometer's point to base_link
+    twist_b: Floats = field(init=False)        # (6, 3) from a turn rate in b to base_link's twist
 
-    @cached_property
-    def forward_b(self) -> Floats:
-        """Return the vehicle's forward axis in b."""
-        return forward_b(self.yaw, self.pitch)
-
-    @cached_property
-    def C_vb(self) -> Floats:
-        """Return the rotation from b to the vehicle's axes."""
-        return matrix_from_rpy([0.0, self.pitch, self.yaw])
-
-    @cached_property
-    def arm_b(self) -> Floats:
-        """Return the vector from the odometer's point to base_link, in b: (3,) m."""
-        return -self.C_vb.T @ self.lever_arm
-
-    @cached_property
-    def twist_b(self) -> Floats:
-        """Return the matrix from a turn rate in b to the twist of base_link: (6, 3)."""
-        return np.concatenate([cross_matrix(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
+    def __post_init__(self) -> None:
+        self.forward_b = forward_b(self.yaw, self.pitch)
+        self.C_vb = matrix_from_rpy([0.0, self.pitch, self.yaw])
+        self.q_bv = quat_from_matrix(self.C_vb.T)
+        self.arm_b = -self.C_vb.T @ self.lever_arm
+        self.twist_b = np.concatenate([
+            cross_matrix(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
 
     def twist_by_turn(self, rate_b: Vector) -> tuple[float, ...]:
         """Return ``twist_b`` times a turn rate in b, rad/s: (6,) m/s, rad/s, as numbers."""
         rate_v = rotate_vector(self.C_vb.tolist(), rate_b)
         return *cross(self.lever_arm.tolist(), rate_v), *rate_v
-
-    @cached_property
-    def q_bv(self) -> Floats:
-        """Return the attitude of the vehicle in b, x y z w."""
-        return quat_from_matrix(self.C_vb.T)
 
 
 def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:

@@ -91,8 +91,12 @@ def error_line(error: BaseException) -> str:
     return f'internal error, please report it: {type(error).__name__}: {text}'
 
 
-def hint(view: SessionView) -> str:
-    """Return the action: provide missing inputs, or the next step."""
+def hint(view: SessionView, action_first: bool = False) -> str:
+    """
+    Return the action: provide missing inputs, or the next step.
+
+    action_first : for a single line: in a leg, the action comes before the estimate.
+    """
     session, state = view.session, view.session.state
     if state is State.COMPUTING:
         return f'computing: {view.stage.as_text() or "started"}; the result follows on ~/status'
@@ -107,7 +111,8 @@ def hint(view: SessionView) -> str:
         return clock_difference_text(view.clock_differences)
     if state is State.RECORDING:
         actions, facts = _recording_hint(view)
-        return '; '.join([*facts, *actions])
+        return '; '.join([*(actions or ['drive on']), *facts] if action_first else
+                         [*facts, *actions])
     if state is State.IDLE:
         if view.config.leg.automatic and view.has_imu:
             return 'start driving: a leg starts automatically'
@@ -116,15 +121,6 @@ def hint(view: SessionView) -> str:
                     f'({view.still_s:.0f} s so far)')
         return 'call ~/start_leg'
     return advice_after_result(view)
-
-
-def hint_action_first(view: SessionView) -> str:
-    """Return the hint for a single line: in a leg the action comes before the estimate."""
-    has_problem = view.is_rejected_so_far or view.missing_inputs or view.clock_differences
-    if view.session.state is State.RECORDING and not has_problem:
-        actions, facts = _recording_hint(view)
-        return '; '.join([*(actions or ['drive on']), *facts])
-    return hint(view)
 
 
 def limit_checks(view: SessionView) -> dict[str, str]:

@@ -266,7 +266,7 @@ class Publishing:
     def show_status(self, view: SessionView) -> DiagnosticArray:
         array = self._array([calibration_status(view)])
         # the hint first: receivers of the status then have it
-        self._show(self._hint, String(data=answers.hint_action_first(view)))
+        self._show(self._hint, String(data=answers.hint(view, action_first=True)))
         self._status.publish(array)
         for name, publisher in self._plotted.items():
             self._show(publisher, Float64(data=current_value(view, name)))

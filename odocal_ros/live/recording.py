@@ -64,12 +64,13 @@ class Inputs:
 
     def required(self, config: Config) -> list[Input]:
         """Return the topics without which no leg can be started."""
-        has_surveyed_ends = config.reference.start and config.reference.end
-        slots = ['imu'] * (not self.without_imu) + ['odometer']
-        slots += ['odometer_right'] * config.odometer.has_two_topics
-        slots += [] if has_surveyed_ends else ['fix']
-        slots += ['heading'] * (config.alignment.heading_source == 'heading_topic')
-        return [self.by_slot[slot] for slot in slots if slot in self.by_slot]
+        is_required = {
+            'imu': not self.without_imu, 'odometer': True,
+            'odometer_right': config.odometer.has_two_topics,
+            'fix': not (config.reference.start and config.reference.end),
+            'heading': config.alignment.heading_source == 'heading_topic'}
+        return [self.by_slot[slot] for slot, required in is_required.items()
+                if required and slot in self.by_slot]
 
     @property
     def without_imu(self) -> bool:
@@ -140,7 +141,7 @@ class Recording:
         self.block_listener: Callable[[str, Samples], None] | None = None
         self._clock = node.get_clock()
         self.progress = self._new_progress()
-        self._clock_jumped = False
+        self._clock_has_jumped = False
         self._jumps = self._clock.create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(seconds=-CLOCK_BACK_S)),
             post_callback=self._note_jump)
@@ -203,8 +204,8 @@ class Recording:
         """Return the other slots that the messages of a topic fill: more wheels, other IMUs."""
         if source.slot == 'imu':
             return ('imu_other',)
-        has_one_topic = source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
-        return WHEELS[1:] if has_one_topic else ()
+        has_all_wheels = source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
+        return WHEELS[1:] if has_all_wheels else ()
 
     @property
     def newest_ns(self) -> int:
@@ -225,11 +226,11 @@ class Recording:
 
     @property
     def has_time_jumped(self) -> bool:
-        return self._clock_jumped or self.inputs.leading_input.health.has_jumped_back
+        return self._clock_has_jumped or self.inputs.leading_input.health.has_jumped_back
 
     def restart(self) -> None:
         """Drop all samples, after a jump of time."""
-        self._clock_jumped = False
+        self._clock_has_jumped = False
         self.recorder.clear()
         self.progress = self._new_progress()
         for source in self.inputs.by_slot.values():
@@ -239,8 +240,8 @@ class Recording:
     def two_wheels(self) -> bool:
         """Return True if there are two wheels, known as left and right."""
         form = self.inputs.form()
-        sent = [self.recorder.newest_ns(slot) > 0 for slot in WHEELS[:3]]
-        return sent == [True, True, False] and (form is None or form.sides_known)
+        first, second, third = (self.recorder.newest_ns(slot) > 0 for slot in WHEELS[:3])
+        return first and second and not third and (form is None or form.sides_known)
 
     def received_before(self, preroll_s: float) -> Received:
         """Return the samples so far that determine what a leg can estimate."""
@@ -266,4 +267,4 @@ class Recording:
         self._jumps.unregister()
 
     def _note_jump(self, _jump: object) -> None:
-        self._clock_jumped = True  # called from within the clock: only a flag is safe
+        self._clock_has_jumped = True  # called from within the clock: only a flag is safe

@@ -74,12 +74,12 @@ class ResultFolders:
         self._written.append(WrittenResult(folder, last_leg_ns, previous_target))
         return ''
 
-    def prune(self, newest: Path, kept: int) -> None:
+    def prune(self, newest: Path, kept_count: int) -> None:
         """
         Remove the oldest results of ``leg.automatic`` in the folder of ``newest``.
 
-        kept : number of newest results kept; 0 keeps all. Also kept: the target of ``latest``, its
-        earlier targets, and the newest usable result.
+        kept_count : number of newest results kept; 0 keeps all. Also kept: the target of
+        ``latest``, its earlier targets, and the newest usable result.
         """
         root = newest.parent
         with locked(root):
@@ -87,16 +87,15 @@ class ResultFolders:
             # by the time, and the count within that second
             by_age = sorted(matches, key=lambda match: (match[1], int(match[2] or 1)))
             names = [match[0] for match in by_age]
-            outdated = names[:-kept] if kept else []
+            outdated = names[:-kept_count] if kept_count else []
+            if not outdated:
+                return
+            newest_usable = next((name for name in reversed(names) if (
+                stored := stored_in(root / name)) and stored.usable), '')
             linked = _link_target(root / LATEST)
-            kept_names = {newest.name, linked, *(
+            kept_names = {newest.name, newest_usable, linked, *(
                 result.previous_target for result in self._written
                 if result.folder.name == linked)}
-            for name in reversed(names if outdated else []):
-                stored = stored_in(root / name)
-                if stored and stored.usable:
-                    kept_names.add(name)
-                    break
             for name in (name for name in outdated if name not in kept_names):
                 stored = stored_in(root / name)
                 if stored and stored.config.get('leg.automatic'):

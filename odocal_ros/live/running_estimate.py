@@ -31,7 +31,7 @@ UPDATE_CPU_SHARE = 1 / 60
 Block: TypeAlias = tuple[str, Any]      # slot, rows
 
 
-@dataclass(frozen=True)
+@dataclass
 class UpdateResult:
     """Result of an update: forecast and faults of the leg so far, or the error."""
 
@@ -74,7 +74,7 @@ class RunningEstimate:
         self._faults: tuple[Reason, ...] = ()
         self._new_blocks: list[Block] = []
         self._is_updating = self._is_loaded = False
-        self._pause_until = 0.0
+        self._pause_until_s = 0.0      # steady clock
 
     def begin(self, recorder: LegRecorder, start_ns: int, config: Config) -> None:
         """Start with a leg from a mark, ns; ``recorder`` has the samples so far."""
@@ -121,7 +121,7 @@ class RunningEstimate:
     def update(self, newest_ns: int, distance_m: float = 0.0) -> None:
         """Submit an update of the leg to a stamp, with its length, m, to the worker if due."""
         if (self._thinned_leg is None or self._is_updating or newest_ns < self._due_ns
-                or time.monotonic() < self._pause_until):
+                or time.monotonic() < self._pause_until_s):
             return
         self._due_ns, self._is_updating = newest_ns + UPDATE_PERIOD_NS, True
         pre_roll, self._pre_roll = self._pre_roll, None
@@ -141,7 +141,7 @@ class RunningEstimate:
         self._section_forecast = result.forecast and replace(
             result.forecast, distance_m=distance_m)
         if self._is_loaded:
-            self._pause_until = time.monotonic() + result.cpu_time_s / UPDATE_CPU_SHARE
+            self._pause_until_s = time.monotonic() + result.cpu_time_s / UPDATE_CPU_SHARE
         self._is_loaded = True       # the first update loads pre-roll and modules: no pause
         if result.error is not None:
             self._log.debug(f'no forecast for the leg: {error_line(result.error)}')
@@ -151,25 +151,21 @@ def _compute_update(thinned: ThinnedLeg, pre_roll: LegRecorder | None, new_block
                     start_ns: int, config: Config, stop_event: threading.Event,
                     smoother: leg_so_far.SmootherSoFar) -> UpdateResult:
     """Return the result of an update; runs in the worker."""
-    begin = time.thread_time()
-    forecast: Forecast | None = None
-    faults: tuple[Reason, ...] = ()
-    update_error: Exception | None = None
+    begin, result = time.thread_time(), UpdateResult()
     try:
         _add_rows(thinned, pre_roll, new_blocks, stop_event)
         leg = thinned.leg(start_ns)
         if is_planar(leg, config):
-            forecast = planar_forecast(leg, config, lambda: not stop_event.is_set())
+            result.forecast = planar_forecast(leg, config, lambda: not stop_event.is_set())
         else:
-            faults = leg_so_far.faults_in_cells(leg, config)
-            forecast = forecast_leg(leg, thinned.fix_rate(), config,
-                                   lambda: not stop_event.is_set(), smoother)
+            result.faults = leg_so_far.faults_in_cells(leg, config)
+            result.forecast = forecast_leg(leg, thinned.fix_rate(), config,
+                                           lambda: not stop_event.is_set(), smoother)
     except Exception as error:  # an error of the running estimate does not end the leg
-        update_error = error
-    finally:
-        leg_so_far.screened_in_cells.cache_clear()      # no later update uses this leg
-    cpu_time_s = time.thread_time() - begin - smoother.cold_start_cpu_s
-    return UpdateResult(forecast, faults, cpu_time_s, update_error)
+        result.error = error
+    leg_so_far.screened_in_cells.cache_clear()      # no later update uses this leg
+    result.cpu_time_s = time.thread_time() - begin - smoother.cold_start_cpu_s
+    return result
 
 
 def _add_rows(thinned: ThinnedLeg, pre_roll: LegRecorder | None, new_blocks: list[Block],
