@@ -101,8 +101,9 @@ class Odometry:
             screen = self._screens[slot] = StampScreen()
             usable = screen.select_usable(rows)
         if screen.dropped:
-            self._notes.append(f'{slot}: {screen.dropped} messages dropped: their stamps differ '
-                               f'from their arrival times by {screen.excess_s:+.3g} s')
+            plural = 's' if screen.dropped > 1 else ''
+            self._notes.append(f'{slot}: {screen.dropped} message{plural} dropped: '
+                               f'{screen.drop_cause}')
         if slot == 'imu':
             self.imu.feed(usable)
         else:

@@ -37,7 +37,8 @@ class StampScreen:
         self.clock_jumped = False
         self.jump_row = 0
         self.excess_s = 0.0           # of the last refused stamp; positive: it is in the future
-        self.dropped = 0              # number of refused rows in the last block
+        self.dropped = 0              # number of rows dropped from the last block
+        self.drop_cause = ''          # of the last of them
         self.rate = 1.0               # speed of a bag played faster than FAST_PLAY, else 1
         self.lag_ns: float | None = None      # least lag
         self._refused_rows = 0        # consecutive ones
@@ -65,7 +66,7 @@ class StampScreen:
         for k, row in enumerate(rows):
             stamp, received = row[:2]      # ns
             if not 0 < stamp < LATEST_STAMP_NS:
-                self.dropped += 1
+                self._drop('a stamp is zero, negative or too large')
                 continue
             lag = received - stamp
             lead_ns = 0.0 if self.lag_ns is None else self.lag_ns - lag
@@ -74,8 +75,10 @@ class StampScreen:
                 if not self._refused_rows:
                     self.jump_row = k
                 self._refused_rows += 1
-                self.dropped += age_ns != 0      # a repeated row is no fault
                 self.excess_s = (-age_ns if age_ns > STAMP_LIMIT_NS else lead_ns) * 1e-9
+                if age_ns:      # a repeated row is no fault
+                    self._drop(f'the stamps differ from the arrival times by {self.excess_s:+.3g} '
+                               f's; the limit is {STAMP_LIMIT_NS * 1e-9:g} s')
                 self.clock_jumped |= self._refused_rows >= CLOCK_SET_ROWS
             elif age_ns < 0:
                 self._refused_rows, self._newest_ns = 0, stamp
@@ -84,12 +87,15 @@ class StampScreen:
                     self.lag_ns = lag
                 else:
                     self.lag_ns -= lead_ns / LAG_ROWS
-            else:
-                self.dropped += age_ns > 0
+            elif age_ns > 0:
+                self._drop(f'a stamp is {age_ns * 1e-9:.3g} s before an earlier one')
             if not self._refused_rows:
                 self._update_median_lag(lag)
         self._update_rate(rows[-1][1] if rows else 0)
         return usable_rows
+
+    def _drop(self, cause: str) -> None:
+        self.dropped, self.drop_cause = self.dropped + 1, cause
 
     def _update_median_lag(self, lag: int) -> None:
         """Update the running median by a lag, ns; it changes slowly, as two clocks drift."""

@@ -222,6 +222,19 @@ def test_a_small_clock_step_is_found_and_late_messages_are_not_one(by_s):
         assert arrivals.clock_step_s(rows) == pytest.approx(abs(by_s), abs=0.015 * bool(by_s))
 
 
+def test_the_cause_of_a_dropped_message_is_stated():
+    stamp = 10**18 + np.arange(0, 20 * SECOND, SECOND // 50)
+    for row, changed, cause in (
+            (500, stamp[498] + 1, 'a stamp is 0.02 s before an earlier one'),
+            (500, 0, 'a stamp is zero, negative or too large'),
+            (500, stamp[500] + SECOND, 'the stamps differ from the arrival times by +1 s; the '
+                                       'limit is 0.2 s')):
+        odometry, odd = started(drive_of(0), 5), stamp.copy()
+        odd[row] = changed
+        odometry.feed('odometer', list(zip(odd.tolist(), stamp.tolist(), range(1000), strict=True)))
+        assert odometry.take_notes() == [f'odometer: 1 message dropped: {cause}']
+
+
 def test_stamps_of_fast_bags_are_usable_and_those_of_set_clocks_are_not():
     stamp = 10**18 + np.arange(0, 60 * SECOND, SECOND // 25)
     arrivals = StampScreen()
