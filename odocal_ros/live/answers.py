@@ -19,7 +19,7 @@ from odocal_ros.safe_io.text_formats import error_text
 
 MAX_REASONS = 3     # judgement: in an answer
 KMH = 3.6    # definition: km/h per m/s
-FORECAST_OLD_S = 15.0    # judgement: age from which the forecast is reported as old
+MAX_FORECAST_AGE_S = 15.0    # judgement: above it, the age is reported
 MIN_MARKS = 2         # judgement: marks from which the hint no longer asks for ~/mark
 DRIVE = 'drive '
 DRIVE_ON = ('then drive on, with stops and left and right turns, until this hint shows OK for '
@@ -192,7 +192,7 @@ def _recording_hint(view: SessionView) -> tuple[list[str], list[str]]:
     if view.forecast is None:
         return [*required, _end_text(view)], facts
     facts.append(view.forecast.as_text(view.distance_m))
-    if view.forecast_age_s > FORECAST_OLD_S:
+    if view.forecast_age_s > MAX_FORECAST_AGE_S:
         facts.append(f'estimate is {view.forecast_age_s:.0f} s old')
     is_last_step = view.forecast.is_complete or view.session.is_automatic
     return required + ([_end_text(view)] if is_last_step else []), facts

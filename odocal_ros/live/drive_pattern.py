@@ -25,7 +25,7 @@ from odocal_ros.settings.node_configs import PatternConfig
 
 PERIOD_S = 0.05       # judgement: base controllers stop after 0.2 s or more without a command
 STOP_COMMANDS = 20            # judgement: zero commands at a stop, since one may be lost
-STUCK_S = 2.0         # judgement: twice the time of the slowest robot for a visible motion
+STUCK_S = 2.0         # judgement: twice the time of the slowest robot for a measurable motion
 FINAL_STOP_COMMANDS, LAST_PERIOD_S = 5, 0.02       # judgement: zero commands of an ending node
 HELP = """\
 usage: drive_pattern --ros-args -p speed:=M_PER_S -p 'rectangle:=[X, Y, X, Y]' [-p NAME:=VALUE]
@@ -156,18 +156,18 @@ class DrivePattern(CheckedNode):
                                                       time.monotonic(), self.config)
         if self._progress.piece == len(self._route):
             self._halt('the pattern is complete')
-        elif self._is_stuck(speed or rate):
+        elif self._is_stuck(is_commanded=bool(speed or rate)):
             self._halt(f'the pose has not changed for {STUCK_S:g} s: the wheels are blocked, or '
                        'the position is frozen')
         else:
             self._send(speed, rate)
 
-    def _is_stuck(self, commanded: float) -> bool:
-        """Return True if a commanded robot has not moved for STUCK_S."""
+    def _is_stuck(self, is_commanded: bool) -> bool:
+        """Return True if the robot has not moved for STUCK_S although it is commanded to."""
         pose, now = self._pose, time.monotonic()
         assert pose is not None
-        if not commanded or self._last_motion is None \
-                or pattern.has_moved(self._last_motion[0], pose):
+        if not is_commanded or self._last_motion is None or pattern.has_moved(
+                self._last_motion[0], pose):
             self._last_motion = pose, now
         return now - self._last_motion[1] > STUCK_S
 

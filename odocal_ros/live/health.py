@@ -1,7 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Health of one topic: rate, lost messages, gaps and jumps of time, for status and operator."""
+"""
+Health of one topic: rate, lost messages, gaps and jumps of time.
+
+In: stamps and sequence numbers of its messages. Out: values for the status, and plausible rows.
+"""
 
 from collections import deque
 from collections.abc import Sequence
@@ -105,9 +109,9 @@ class Health:
         if rising:
             limit = max_gap_s or 5 * self._interval_s
             self.gap_count += sum(step > limit for step in rising) if limit else 0
-            typical = rising[(len(rising) - 1) // 2]
-            self._interval_s = 0.9 * self._interval_s + 0.1 * typical if self._interval_s \
-                else typical
+            median_s = rising[(len(rising) - 1) // 2]
+            self._interval_s = (0.9 * self._interval_s + 0.1 * median_s if self._interval_s
+                                else median_s)
         self.newest_ns = newest
         self._block_ends.append((self.count, newest))
 

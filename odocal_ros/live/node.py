@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The calibration node: it builds its parts, connects them, and runs them by one timer."""
+"""The calibration node: builds recording, session, publishing and journal; one timer runs all."""
 
 from collections.abc import Callable
 from functools import partial
@@ -57,7 +57,7 @@ class Calibrator(CheckedNode):
     """
 
     default_name = 'calibrator'
-    has_running_thread = False      # after the end of the node; it ends with the process
+    has_running_thread = False      # True: a thread still runs after the end of the node
 
     def _build(self) -> None:
         self.config = params.declare_settings(self)
@@ -74,7 +74,7 @@ class Calibrator(CheckedNode):
         self._lock = threading.RLock()  # for executors with several threads
         self._due_ns = dict.fromkeys(('search', 'diagnostics', 'status'), 0)
         self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._take_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
         group = ReentrantCallbackGroup()  # a delayed answer must not block callbacks
         for name in SERVICES:
             command = getattr(self.operation, name)
@@ -105,7 +105,7 @@ class Calibrator(CheckedNode):
             refusal = refusal or str(error)
         return SetParametersResult(successful=not refusal, reason=refusal)
 
-    def _take_parameters(self, parameters: list[Parameter]) -> None:
+    def _apply_parameters(self, parameters: list[Parameter]) -> None:
         self.config = params.with_parameters(self.config, parameters)
 
     def _tick(self) -> None:
@@ -114,15 +114,15 @@ class Calibrator(CheckedNode):
             if self._due('search', SEARCH_PERIOD_S):
                 self.recording.inputs.update(self.config)
                 session = self.operation.session
-                self.recording.drop_old_samples(self.config.leg.preroll,
-                                      session.start_ns if session.has_open_leg else 0)
+                self.recording.drop_old_samples(
+                    self.config.leg.preroll, session.start_ns if session.has_open_leg else 0)
             if self._due('diagnostics', self.config.diagnostic_updater.period):
                 self.publishing.show_diagnostics(self.recording, self.config)
             if self._due('status', 1 / self.config.publish.rate):
                 self.operation.show_status()
-            self._pace()
+            self._set_period()
 
-    def _pace(self) -> None:
+    def _set_period(self) -> None:
         """Set the period of ``_tick``: shorter while a caller waits."""
         is_awaited = self.operation.is_awaited
         period_s = AWAITED_TICK_S if is_awaited else min(TICK_S, 1 / self.config.publish.rate)
@@ -147,7 +147,7 @@ class Calibrator(CheckedNode):
         try:
             with self._lock:
                 answer = command()
-                self._pace()
+                self._set_period()
             response.success, response.message = (
                 await answer if isinstance(answer, Future) else answer)
         except OdocalError as refused:

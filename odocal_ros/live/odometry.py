@@ -96,7 +96,7 @@ class OdometryNode(CheckedNode):
                         for slot in ('imu', *wheels)}
         params.check_qos(self, (source.topic for source in self._inputs.values()))
         for source in self._inputs.values():
-            source.check(self.config)
+            source.subscribe_fixed_type(self.config)
         frames = self.config.frames
         self._pose = TemplatePublisher(self, 'odometry', OdometryMessage(
             header=Header(frame_id=frames.odom), child_frame_id=frames.base))
@@ -187,9 +187,7 @@ class OdometryNode(CheckedNode):
         """Search for publishers, and log missing inputs at a low rate."""
         inputs = self._inputs.values()
         for source in inputs:
-            source.update_publishers()
-            if not source.is_flowing():
-                source.find_type(self.config)
+            source.search_publishers(self.config)
         for text in self._topics.new_texts(
                 {source.topic: source.health.lost_count for source in inputs},
                 [source.duplicate_publishers() for source in inputs]):

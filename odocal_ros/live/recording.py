@@ -37,12 +37,10 @@ class Inputs:
         self._node, self._needs_imu = node, config.odometer.needs_imu
         self.by_slot: dict[str, Input] = {}
         for slot, allowed in _used_inputs(config).items():
-            source = self.by_slot[slot] = Input(node, slot, allowed)
-            source.check(config)
+            self.by_slot[slot] = Input(node, slot, allowed)
         self._check_reference()
         for source in self.by_slot.values():
-            if len(source.allowed_types) == 1:  # one fixed type: errors are raised at the start
-                source.subscribe(source.allowed_types[0], config)
+            source.subscribe_fixed_type(config)      # its errors are raised at the start
 
     def _check_reference(self) -> None:
         """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
@@ -58,9 +56,7 @@ class Inputs:
             if slot not in self.by_slot:
                 self.by_slot[slot] = Input(self._node, slot, allowed)
         for source in self.by_slot.values():
-            source.update_publishers()
-            if not source.is_flowing():
-                source.find_type(config)
+            source.search_publishers(config)
 
     def required(self, config: Config) -> list[Input]:
         """Return the topics without which no leg can be started."""

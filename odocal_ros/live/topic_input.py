@@ -1,7 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One input topic of a node, from the search for its publishers to samples."""
+"""
+One input topic of a node, from the search for its publishers to samples.
+
+In: the name of the input and the messages of its topic. Out: blocks of samples, the health of the
+topic, and the reason as text if it cannot be used.
+"""
 
 from collections.abc import Callable, Sequence
 import difflib
@@ -80,31 +85,33 @@ class Input:
         self.msgtype = ''
         self.reader: Reader | None = None
         self.health = Health()
-        self.error = ''      # why the topic or its last messages cannot be used
-        self.is_plausible = np.empty(0, bool)    # rows of the last block with a plausible stamp
+        self.error = ''      # cause if the topic or its last messages cannot be used
+        self.is_plausible = np.empty(0, bool)    # mask of plausible stamps in the last block
         self.frame = ''        # frame_id of the IMU's messages, once one has come
         self.publishers: list[TopicEndpointInfo] = []
         self.suggestions: list[str] = []     # suggested topics if this one has no publisher
-        self._failed = 0       # messages whose block raised an error
-        self._unreported: list[Reading] = []     # stamps and ``received_ns`` not yet in ``health``
+        self._failed_count = 0      # messages whose block raised an error
+        # stamps and ``received_ns`` that are not in ``health`` yet
+        self._new_stamps: list[Reading] = []
         self._configured_frame = ''     # imu.frame_id at the subscription
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
         self.queue = MessageQueue(node)
         self.static_transforms: StaticTransforms | None = None     # second topic of a TF reference
 
-    def check(self, config: Config) -> None:
-        """Raise OdocalError at start-up if the one allowed message type cannot be read."""
+    def subscribe_fixed_type(self, config: Config) -> None:
+        """Subscribe if only one type is allowed; raise OdocalError if it cannot be read."""
         if len(self.allowed_types) == 1:
-            message_class(self.allowed_types[0])
-            make_reader(self.slot, self.allowed_types[0], config)
+            self.subscribe(self.allowed_types[0], config)
 
-    def update_publishers(self) -> None:
-        """Update clock and publishers, and without any the suggested topics."""
+    def search_publishers(self, config: Config) -> None:
+        """Update clock and publishers; without messages also suggested topics and the type."""
         self.queue.follow_clock()
         self._update_health()
         self.publishers = self._node.get_publishers_info_by_topic(self.topic)
         self.suggestions = [] if self.publishers else self._suggested_topics()
+        if self.reader is None:
+            self._find_type(config)
 
     def _suggested_topics(self) -> list[str]:
         """Return published topics of a suitable type, the most similar name first."""
@@ -136,13 +143,12 @@ class Input:
         return (f'{self.topic} has {len(same_type)} publishers ({names_text}): their messages are '
                 'mixed; stop all but one')
 
-    def find_type(self, config: Config) -> None:
+    def _find_type(self, config: Config) -> None:
         """Find the message type and subscribe; an error is logged and stored in ``error``."""
-        if self.reader is not None:
-            return
-        published = [p.topic_type for p in self.publishers[:1]]
+        published_types = [p.topic_type for p in self.publishers]
+        types = self.allowed_types if len(self.allowed_types) == 1 else published_types
         try:
-            for msgtype in self.allowed_types if len(self.allowed_types) == 1 else published:
+            for msgtype in types[:1]:
                 self.subscribe(msgtype, config)
         except (OdocalError, ParameterException, InvalidQosOverridesError) as error:
             text = error_text(error)
@@ -160,22 +166,20 @@ class Input:
         self._configured_frame = config.imu.frame_id
         # wait for a publisher: increments need its QoS, and an optional topic may never have one,
         # but its subscription would cost CPU time
-        if not self.publishers and (self.slot in EXTERNAL_SLOTS
-                                    or self._has_increments(reader)):
+        if not self.publishers and (self.slot in EXTERNAL_SLOTS or self._has_increments(reader)):
             return
         offered = {p.qos_profile.reliability for p in self.publishers}
-        reliable = self._has_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}
-        qos = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST, depth=INPUTS[self.slot].queue,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
+        is_reliable = self._has_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}
+        policy = ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT
+        qos = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=INPUTS[self.slot].queue,
+                         reliability=policy)
         self._deserialize = partial(deserialize_message, message_type=kind)
         self.queue.subscribe(kind, self.name, qos)
         self.reader, self.msgtype, self.error = reader, msgtype, ''
         if isinstance(reader, TransformReader):
             self.static_transforms = StaticTransforms(self._node, self.topic, kind, reader.static)
         self._node.get_logger().info(
-            f'{self.slot}: {msgtype} on {self.topic}, '
-            f'{"reliable" if reliable else "best effort"}')
+            f'{self.slot}: {msgtype} on {self.topic}, {QOS_NAMES[policy]}')
 
     @staticmethod
     def _has_increments(reader: Reader) -> bool:
@@ -206,22 +210,21 @@ class Input:
                     self.health.fix_status = int(block.status[-1])
         return pairs
 
-    def readings(self, raws: list[bytes],
-                 sent_ns: list[int]) -> list[tuple[str, list[Reading]]]:
+    def readings(self, raws: list[bytes], sent_ns: list[int]) -> list[tuple[str, list[Reading]]]:
         """Return (slot, readings) pairs of a few messages: as ``decode``, but faster."""
         pairs = self._read(self.reader.readings if self.reader else None, raws, sent_ns)
         for slot, rows in pairs:
-            self._unreported += [row[:2] for row in rows] if slot == self.slot else []
-        if len(self._unreported) > HEALTH_ROWS:
+            self._new_stamps += [row[:2] for row in rows] if slot == self.slot else []
+        if len(self._new_stamps) > HEALTH_ROWS:
             self._update_health()
         return pairs
 
     def _update_health(self) -> None:
         """Add the readings since the last call to the health."""
-        if self._unreported:
-            stamps, received_ns = zip(*self._unreported, strict=True)
+        if self._new_stamps:
+            stamps, received_ns = zip(*self._new_stamps, strict=True)
             self.health.check_stamps(list(stamps), received_ns)
-            self._unreported = []
+            self._new_stamps = []
 
     def _read(self, read: ReadMethod | None, raws: list[bytes],
               sent_ns: list[int]) -> list[tuple[str, Any]]:
@@ -234,10 +237,10 @@ class Input:
             if self.slot == 'imu':
                 self.frame = reader.frame or self.frame or deserialize(raws[0]).header.frame_id
         except Exception as error:  # no message may stop the node
-            self._failed += len(raws)
+            self._failed_count += len(raws)
             self.error = f'{self.topic}: {error_text(error)}'
             pairs = []
-        self.health.unreadable_count = self._failed + reader.unreadable
+        self.health.unreadable_count = self._failed_count + reader.unreadable
         if not pairs and reader.error:
             self.error = f'{self.topic}: {reader.error}'
         return pairs

@@ -31,7 +31,7 @@ from odocal_ros.live.messages import LATCHED
 from odocal_ros.output.value_text import with_sigma
 from odocal_ros.safe_io.text_formats import brief_line
 
-# of each level of a DiagnosticStatus: OK, WARN, ERROR, STALE
+# by level of a DiagnosticStatus: OK, WARN, ERROR, STALE
 COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}
 MAX_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100
 HINT_S = 0.1      # judgement: s in which the hint that is sent with a status arrives
@@ -54,11 +54,11 @@ def progress_shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     """Return the progress towards each limit: label -> (0 to 1, text)."""
     if status.get('state') == 'computing':
         return {}      # passes are in the hint, since their total is unknown
-    driven, missing_m = number(status, 'distance_m'), number(status, 'distance_to_minimum_m')
+    driven_m, missing_m = number(status, 'distance_m'), number(status, 'distance_to_minimum_m')
     standstill_s = number(status, 'seconds_to_stand')
     bars = {}
-    if driven + missing_m > 0:      # a leg
-        bars['path'] = driven / (driven + missing_m), f'{missing_m:.0f} m to go'
+    if driven_m + missing_m > 0:      # a leg
+        bars['path'] = driven_m / (driven_m + missing_m), f'{missing_m:.0f} m to go'
     bars['standstill'] = 1 - standstill_s / PREDICTED_REST_S, f'{standstill_s:.0f} s to go'
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
         required = number(status, f'required_{name}_sigma_{unit}')
@@ -103,6 +103,7 @@ def _bars(status: dict[str, str]) -> Table:
 def _values(status: dict[str, str]) -> str:
     state = status.get('state')
     prefix = 'estimate_' if state in ('recording', 'computing') else ''
+    # label, key, key of the sigma, factor to the printed unit, this unit
     keys = (('scale factor', 'scale_factor', 'scale_factor_sigma', 1.0, ''),
             ('yaw', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad', degrees(1), ' deg'))
     texts = [f'{label} {with_sigma(value, number(status, prefix + sigma) or None, factor)}{unit}'

@@ -48,19 +48,14 @@ class MessageView:
             return 0
 
     def value(self, path: str) -> Any:
-        """
-        Return the value at a path.
-
-        [name] is the index of a name in the list ``name`` beside the list; or LookupError,
-        AttributeError, TypeError.
-        """
+        """Return the value at a path; AttributeError, LookupError, TypeError if it is missing."""
         value: Any = self.message
         owner = value      # message that contains ``value``
         for name, key in path_parts(path):
             if name:
                 value, owner = getattr(value, name), value
                 continue
-            names = list(getattr(owner, 'name', ()))
+            names = list(getattr(owner, 'name', ()))      # beside the list, of its elements
             if key not in names and not key.isdigit():
                 raise LookupError(f'no {key!r} among {", ".join(map(str, names)) or "no names"}')
             value = value[names.index(key) if key in names else int(key)]

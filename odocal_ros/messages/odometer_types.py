@@ -50,8 +50,8 @@ class OdometerPlan:
     joints are wheels? is a field of an unknown type an integer?): ``complete`` is called with
     messages in order until it returns True.
 
-    wheel_keys : the wheels in a message, joint names or indices; ('',) for a single value.
-    columns    : the values to read, () until the plan is complete.   form : their meaning.
+    wheel_keys : of the wheels in a message, joint names or indices; ('',) for a single value.
+    columns : the values to read, () until the plan is complete.   form : their meaning.
     """
 
     has_readings = True      # messages can be read as plain numbers
@@ -61,12 +61,12 @@ class OdometerPlan:
         self.is_known_type = msgtype in DEFAULT_FIELD
         self.field = config.odometer.field or DEFAULT_FIELD.get(msgtype, '')
         self.wheel_keys = _configured_wheels(slot, config)
-        self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
+        self.is_stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
         self.columns: tuple[Column, ...] = ()
         self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
-        self._unclear_reason = ''       # why the last message did not determine the wheels
+        self._unclear_reason = ''       # cause if the last message does not determine the wheels
         self._check_settings()
-        has_key = _split_key(self.field)[1] or self.wheel_keys[0]
+        has_key = bool(_split_key(self.field)[1] or self.wheel_keys[0])
         self._selects_wheels = self._is_list() and not has_key
         self._fields: tuple[str, ...] = (self.field,)      # the first one with values is used
         if msgtype == JOINTS and not self.field:
@@ -154,7 +154,7 @@ class OdometerPlan:
             if not isinstance(value, (Integral, float, np.floating)):
                 raise BadData(f'odometer.field: {path!r} of {self.msgtype} is not a number but '
                               f'{type(value).__name__}; name one value, such as path.to.value[0]')
-        self.stamped = hasattr(view.message, 'header')
+        self.is_stamped = hasattr(view.message, 'header')
         self._set_columns(self.field, 'int64' if isinstance(value, Integral) else 'float64')
 
     def _set_columns(self, field: str, value_type: str = '') -> None:
@@ -162,7 +162,7 @@ class OdometerPlan:
         value_type = value_type or self._value_type(field)
         self.form = self._form_of(field, value_type)
         dtype = np.int64 if 'int' in value_type else np.float64
-        self.columns = STAMP * self.stamped + tuple(
+        self.columns = STAMP * self.is_stamped + tuple(
             Column(dtype, 1, self._paths_of_wheel(field, key)) for key in self.wheel_keys)
 
     def _value_type(self, field: str) -> str:
@@ -210,7 +210,7 @@ class OdometerPlan:
         if self._unclear_reason and not self.columns:
             return self._unclear_reason
         wheels = ' and '.join(key for key in self.wheel_keys if key)
-        required = wheels or self.field or 'any position'
+        required = wheels or self.field or ' or '.join(self._fields)
         names = f'; names: {", ".join(view.names)}' if view.names else ''
         return f'no {required} in a {self.msgtype}{names}'
 
@@ -221,16 +221,17 @@ class OdometerPlan:
     def readings(self, received_ns: Sequence[int], values: list[Any]
                  ) -> list[tuple[str, list[Reading]]]:
         """Return (slot, rows in plain numbers) from the values of each message."""
-        first_wheel = len(STAMP) * self.stamped      # columns before the values
-        return [(slot, [
-            (row[0][0] * 10**9 + row[1][0] if self.stamped else received, received, row[wheel][0])
-            for received, row in zip(received_ns, values, strict=True)])
+        stamps, first_wheel = received_ns, len(STAMP) * self.is_stamped
+        if self.is_stamped:      # columns: s, ns, then the wheels
+            stamps = [second * 10**9 + nanosecond for (second,), (nanosecond,), *_ in values]
+        return [(slot, [(stamp, received, row[wheel][0]) for stamp, received, row in zip(
+            stamps, received_ns, values, strict=True)])
             for wheel, slot in enumerate(self._slots, first_wheel)]
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
         """Return (slot, samples) of each wheel from the values of ``columns``."""
-        stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
-        values = columns[len(STAMP) * self.stamped:]
+        stamps = stamp_ns(columns[0], columns[1]) if self.is_stamped else received_ns
+        values = columns[len(STAMP) * self.is_stamped:]
         return [(slot, from_columns(OdometerSamples, stamps, received_ns, value[:, 0]))
                 for slot, value in zip(self._slots, values, strict=True)]
 

@@ -49,15 +49,13 @@ def select_wheels(names: Sequence[str], count: int) -> WheelChoice | str:
     if len(set(keys)) < len(keys):
         return f'two joints with the same name in {_list_text(keys)}'
     selected = _select_by_name(names) if names else tuple(keys)
-    if len(keys) == 1:
-        if not selected:
-            return (f'its only joint, {keys[0]}, does not have a wheel name; select it with '
-                    'odometer.field')
-        return WheelChoice((keys[0],), True, '')
+    if len(keys) == 1 and not selected:
+        return (f'its only joint, {keys[0]}, does not have a wheel name; select it with '
+                'odometer.field')
     if isinstance(selected, WheelChoice):
         return selected
     if len(selected) == 1:
-        return WheelChoice(selected, True, (
+        return WheelChoice(selected, True, '' if len(keys) == 1 else (
             f'joints {_list_text(keys)}: only {selected[0]} is used, selected by name'))
     if len(selected) == 2:
         noun = 'joints' if names else 'values'

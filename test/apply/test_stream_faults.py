@@ -231,7 +231,8 @@ def test_the_cause_of_a_dropped_message_is_stated():
                                        'limit is 0.2 s')):
         odometry, odd = started(drive_of(0), 5), stamp.copy()
         odd[row] = changed
-        odometry.feed('odometer', list(zip(odd.tolist(), stamp.tolist(), range(1000), strict=True)))
+        rows = zip(odd.tolist(), stamp.tolist(), range(1000), strict=True)
+        odometry.feed('odometer', list(rows))
         assert odometry.take_notes() == [f'odometer: 1 message dropped: {cause}']
 
 
