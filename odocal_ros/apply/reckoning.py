@@ -46,7 +46,7 @@ CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, FORCE_GAP = 1.0, 0.2, 10.0, 0.1
 # judgement: number of consecutive mismatches of force and motion after which the attitude is
 # invalid, if the size of the force differs from gravity by less than this, m/s^2
 MAX_MISMATCHES, GRAVITY_TOLERANCE = 10, 1.0
-MAX_OLD_ROWS = 200        # judgement: IMU rows before the path, then the oldest are dropped
+MAX_OLD_ROWS = 200        # judgement: IMU rows before the path; the oldest are dropped
 MAX_PERIOD_CHANGE = 0.1     # judgement: relative; after a larger one covariances are recomputed
 NO_TURN = np.zeros(3)     # definition: rad, value of ``_implausible_turn`` if there is none
 MAX_TILT_SIGMA = 0.5      # rad; judgement: a larger one is beyond a linearised correction
@@ -58,10 +58,9 @@ class DeadReckoning:
     def __init__(self, start: Start, imu: ImuStream, wheels: Wheels, vehicle: Vehicle,
                  config: ApplyConfig, notes: list[str], delay_sigma: float) -> None:
         self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
-        self._notes, self.failed = notes, ''
-        self._delay = DelaySearch(SPEED_SPAN, delay_sigma)
+        self._notes, self.failed, self._delay = notes, '', DelaySearch(SPEED_SPAN, delay_sigma)
         imu.drop(start.row)
-        # state at the time _t of an IMU row; _s : travel, m
+        # state at the time _t, s, of an IMU row; _s : travel, m
         self._t, self._s = imu.rows[imu.path_row].t, wheels.travel_at(imu.rows[imu.path_row].t)
         self.q: Quaternion = tuple(start.q_nb.tolist())     # attitude of b in n
         self._C_nb = rotation_matrix(self.q)
@@ -90,13 +89,13 @@ class DeadReckoning:
         """
         Return the poses that are due and whose samples have arrived.
 
-        clock_step, permanent_step : s, by the last rows; by the last PERMANENT_ROWS.
+        clock_step, permanent_step : s, by the last STEP_ROWS and PERMANENT_ROWS of a topic.
         """
         poses: list[Pose] = []
         if permanent_step and not self._permanent_step:
-            self._notes.append(f'stamps shifted by {permanent_step:.2g} s relative to their '
-                               'arrival times; sigma increased. Likely cause: a clock was set, '
-                               'or messages are late')
+            self._notes.append(f'the stamps are shifted by {permanent_step:.2g} s relative to '
+                               'their arrival times; the position sigma is increased. Likely '
+                               'cause: a clock was set, or messages are late')
         self._permanent_step = max(self._permanent_step, permanent_step)
         clock_step = max(self._permanent_step, clock_step)
         self.errors.has_changed |= clock_step != self._clock_step
@@ -158,8 +157,8 @@ class DeadReckoning:
         travel_variance = self.wheels.variance_between(self._t, t[-2])
         self._travel_variance += travel_variance
         self.errors.add_interval(T, C_nb, travel_n, turn_n, travel_variance, long_gaps)
-        self._turned_velocity_n = add_scaled(self._turned_velocity_n, cross(turn_n, travel_n),
-                                             1 / T)
+        self._turned_velocity_n = add_scaled(
+            self._turned_velocity_n, cross(turn_n, travel_n), 1 / T)
         self._add_turn_variance([row.implausible_rate for row in path_rows[1:]], gaps)
         if dropped_travel > self.wheels.quantum:
             self.errors.add_travel(dropped_travel)
@@ -183,8 +182,8 @@ class DeadReckoning:
             return
         C_nb = np.array(self._C_nb)
         if self._implausible_turn is NO_TURN:
-            self._notes.append(f'the gyro jumps in one sample by {np.max(rates):.2g} rad/s, '
-                              'more than a vehicle can turn: the gyro is down-weighted')
+            self._notes.append(f'the turn rate jumps by {np.max(rates):.2g} rad/s in one sample, '
+                               'more than a vehicle can turn; the attitude sigma is increased')
         turn = self._implausible_turn + np.array(gaps) @ rates
         self.errors.add_turn(C_nb @ np.diag(turn**2 - self._implausible_turn**2) @ C_nb.T)
         self._implausible_turn = turn
@@ -293,9 +292,9 @@ class DeadReckoning:
                                     delay_sigma),
                         *add_scaled(ZERO, rotate_vector(self._C_nb, rate_b), self._clock_step))
         travel_variance, increment_variance = self.wheels.variances(self._t, T)
+        increment_variance += self._travel_variance
         return covariances(
             self.errors.pose_and_twist(self._C_nb, arm_n, self.vehicle.twist_b, T), delay_effect,
             add_scaled(ZERO, forward_n, math.sqrt(travel_variance)),
             [self.errors.grade.gyro_scale_sigma * component for component in twist_by_turn],
-            mean_velocity_variances(self.vehicle, speed, T,
-                                    increment_variance + self._travel_variance))
+            mean_velocity_variances(self.vehicle, speed, T, increment_variance))

@@ -230,7 +230,8 @@ class ImuStream:
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
                 rows.append(ImuRow((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
-        self._note_dropped(held_count + len(readings) - len(rows), 'hold NaN or impossible values')
+        self._note_dropped(held_count + len(readings) - len(rows),
+                           f'hold NaN, or exceed {MAX_TURN:g} rad/s or {MAX_FORCE:g} m/s^2')
         kept, self._held = self._screen.screen(rows)
         self._note_dropped(len(rows) - len(kept) - len(self._held),
                            'jump and return, or repeat one value')

@@ -173,7 +173,8 @@ class Wheel:
     def _interpolated_travel(self, dt: float, step: float, row_speed: float) -> float:
         """Return the travel, m, that replaces that of an implausible row; add its variance."""
         self.notes.append(f'the counter jumps by {step:+z.1f} m in {dt:.2f} s: a reset or an '
-                         f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
+                          'invalid value, not motion; the travel is interpolated at '
+                          f'{self.speed:.1f} m/s')
         if abs(row_speed * dt) <= self._step_limit(dt):      # else it is certainly not travel
             self._refused_error += row_speed * dt - self.speed * dt
         # uniform error up to the travel at this speed and acceleration
@@ -232,7 +233,7 @@ class Wheel:
             self.speed = row_speed if deviation > self._deviation_limit(dt) else self.speed
         elif stops_abruptly:
             self.notes.append(f'the counter stops abruptly from {self.speed:.1f} m/s: it hangs, '
-                              'or the wheel locks; sigma increased')
+                              'or the wheel locks; the position sigma is increased')
             self._unexplained_speed, self._speed_before = abs(self.speed), self.speed
             self._unexplained_travel = self._unexplained_time = 0.0
         elif deviation > self._deviation_limit(dt, HARD_BRAKING):
@@ -265,8 +266,7 @@ class Wheel:
     def _add_refused_variance(self) -> None:
         """Add the variance of refused travel, which may be real: one common error."""
         before = self._refused_travel
-        self._refused_travel += self._refused_error
-        self._refused_error = 0.0
+        self._refused_travel, self._refused_error = before + self._refused_error, 0.0
         self._add_variance(max(self._refused_travel**2 - before**2, 0.0))
 
     def _add_variance(self, variance: float) -> None:
@@ -289,12 +289,12 @@ class Wheel:
         """Return the travel, m, that ``step`` lacks for a gap of dt s; note it, add variance."""
         if self.form.quantity == 'cumulative':
             self.notes.append(f'no odometer message for {dt:.2f} s: the counts of this gap are '
-                             'distributed evenly')
+                              'distributed evenly')
             return 0.0
         missing = dt - self.mean_interval     # s
         largest_speed = max(abs(self.speed), abs(step) / dt)
         error = min(missing / GAP_ERROR_TIME, MAX_GAP_ERROR)      # of a uniform distribution
         self._add_variance((error * largest_speed * missing)**2 / 3)
         self.notes.append(f'no odometer message for {dt:.2f} s: the travel is interpolated from '
-                         'the adjacent speeds')
+                          'the adjacent speeds')
         return 0.0 if self._is_speed else self.speed * missing
