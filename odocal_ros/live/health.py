@@ -17,6 +17,9 @@ from odocal_ros.settings.levels import TIME_RESTART_NS, TIME_RESTART_ROWS
 # judgement: time span and number of blocks of a rate; silence of a lost topic
 RATE_SPAN_NS, RATE_BLOCKS = 3 * 10**9, 64
 SILENCE_NS = 2 * 10**9
+# judgement: intervals of the stamps: longest step that is no gap, and longest silence of a topic;
+# share of a new interval in their mean
+GAP_LIMIT_INTERVALS, NEW_INTERVAL_SHARE = 5, 0.1
 # judgement: a stamp further ahead is accepted as the last of TIME_RESTART_ROWS such stamps
 STAMP_JUMP_NS = 30 * 10**9
 
@@ -69,7 +72,7 @@ class Health:
         Process the stamps of some rows, ns.
 
         received_ns : as in the samples, the send time of live messages.   max_gap_s : longer steps
-        are gaps; None: steps above 5 intervals. Returns a mask of rows with a plausible stamp: not
+        are gaps; None: those above GAP_LIMIT_INTERVALS. Returns a mask of plausible stamps: not
         zero, not far ahead or behind.
         """
         self.count += len(stamps)
@@ -102,25 +105,23 @@ class Health:
         return plausible
 
     def _update_times(self, stamps: list[int], max_gap_s: float | None) -> None:
-        stamps_with_last = [self.newest_ns, *stamps] if self.newest_ns else stamps
-        steps = [after - before for before, after in pairwise(stamps_with_last)]
-        newest = self._newest_after(stamps_with_last, steps)
+        stamps = [self.newest_ns, *stamps] if self.newest_ns else stamps
+        steps = [after - before for before, after in pairwise(stamps)]
         rising = sorted(step * 1e-9 for step in steps if step > 0)
         if rising:
-            limit = max_gap_s or 5 * self._interval_s
+            limit = GAP_LIMIT_INTERVALS * self._interval_s if max_gap_s is None else max_gap_s
             self.gap_count += sum(step > limit for step in rising) if limit else 0
             median_s = rising[(len(rising) - 1) // 2]
-            self._interval_s = (0.9 * self._interval_s + 0.1 * median_s if self._interval_s
-                                else median_s)
-        self.newest_ns = newest
-        self._block_ends.append((self.count, newest))
+            share = NEW_INTERVAL_SHARE if self._interval_s else 1.0
+            self._interval_s += (median_s - self._interval_s) * share
+        self.newest_ns = self._newest_after(stamps, steps)
+        self._block_ends.append((self.count, self.newest_ns))
 
-    def _newest_after(self, stamps_with_last: list[int], steps: list[int]) -> int:
+    def _newest_after(self, stamps: list[int], steps: list[int]) -> int:
         """Return the newest stamp after a block, and note whether time has restarted."""
         # one or two stamps far behind are a driver error, more are a restart of time; if a block
         # ends with few of them, or has one row only, the next block decides
         earlier_stale_rows, self._stale_rows = self._stale_rows, 0
-        stamps = stamps_with_last
         if not steps or min(steps) >= -TIME_RESTART_NS:
             return stamps[-1]
         k = steps.index(min(steps))      # the largest step back
@@ -143,7 +144,7 @@ class Health:
         return (now_ns - self.last_arrival_ns) * 1e-9 if self.last_arrival_ns else float('inf')
 
     def is_flowing(self, now_ns: int) -> bool:
-        limit_s = max(SILENCE_NS * 1e-9, 5 * self._interval_s)
+        limit_s = max(SILENCE_NS * 1e-9, GAP_LIMIT_INTERVALS * self._interval_s)
         return bool(self.newest_ns) and self.silent_s(now_ns) < limit_s
 
     def rate_hz(self, now_ns: int) -> float:
@@ -154,5 +155,5 @@ class Health:
         if len(recent) < 2:
             recent = list(self._block_ends)[-2:]
         (first_count, first_ns), (count, newest_ns) = recent[0], recent[-1]
-        return (count - first_count) / ((newest_ns - first_ns) * 1e-9) if (
-            newest_ns > first_ns) else 0.0
+        duration_s = (newest_ns - first_ns) * 1e-9
+        return (count - first_count) / duration_s if duration_s > 0 else 0.0

@@ -46,8 +46,8 @@ class LegCompletion:
         """Use ``config()``, the configuration in force; a running leg keeps that of its start."""
         self.session = Session()
         self.session.restored_result = restored_from(publishing.results())
-        self._recording, self._publishing, self._config = recording, publishing, config
-        self._journal = journal
+        self._recording, self._publishing = recording, publishing
+        self._config, self._journal = config, journal
         self._log, self._clock = node.get_logger(), node.get_clock()
         self._worker = worker.Worker()
         self._running_estimate = RunningEstimate(self._worker, self._log)
@@ -177,10 +177,9 @@ class LegCompletion:
         return self._recording.newest_ns
 
     def _stop_when_too_long(self) -> None:
-        session = self.session
-        limit = session.config.leg.max_duration
-        if session.state is State.RECORDING and (
-                self._recording.newest_ns - session.start_ns) * 1e-9 > limit:
+        session, limit = self.session, self.session.config.leg.max_duration
+        duration_s = (self._recording.newest_ns - session.start_ns) * 1e-9
+        if session.state is State.RECORDING and duration_s > limit:
             self._log.warning(
                 f'leg {session.leg_id} is stopped: it reached leg.max_duration, {limit:g} s')
             self.end_leg_now()
@@ -263,21 +262,22 @@ class LegCompletion:
             return
         self.session.finish(leg.results, leg.calibration)
         self.session.set_carried(leg.carried, leg.released_count)
-        success, text = self._publish_result(leg.calibration, leg.paths, leg.results)
-        if success and self._config().output.autosave:
+        is_usable = self._publish_result(leg.calibration, leg.paths, leg.results)
+        if is_usable and self._config().output.autosave:
             self._save(leg.calibration)
 
     def _publish_result(self, calibration: Calibration, paths: worker.Paths,
-                        parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
+                        parts: Sequence[LegResult] = ()) -> bool:
+        """Publish and answer a result; return True if it is usable."""
         self._publishing.set_results(calibration)
         self._publishing.show_paths(paths)
         view = self.view()
-        success, text = answers.result_answer(calibration, parts, self.session.leg_id,
-                                              quantities_text(answers.limit_checks(view)),
-                                              answers.advice_after_result(view))
+        is_usable, text = answers.result_answer(
+            calibration, parts, self.session.leg_id, quantities_text(answers.limit_checks(view)),
+            answers.advice_after_result(view))
         self._log.info(text)
-        self._active_job.answer(success, text)
-        return success, text
+        self._active_job.answer(is_usable, text)
+        return is_usable
 
     def _dropped_leg_text(self) -> str:
         """Return the text on a leg that was dropped automatically, empty without one."""

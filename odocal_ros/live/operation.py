@@ -13,6 +13,7 @@ from odocal_ros.data.samples import Samples
 from odocal_ros.forecast.quantities import quantities_text
 from odocal_ros.live import answers, worker
 from odocal_ros.live.leg_completion import LegCompletion
+from odocal_ros.live.params import RESULTS
 from odocal_ros.live.result_folders import LATEST, output_root
 from odocal_ros.live.session import CommandRefused, State
 from odocal_ros.output.stored import Stored, stored_in
@@ -204,12 +205,11 @@ class Operation(AutomaticLegs):
         self._saver.withdraw(self.session.start_ns)
         self.show_status()
         if not remaining:
-            self._publishing.set_results(None)
-            self._publishing.show_paths(worker.leg_paths(None, self._config()))
+            text += '; no leg is left'
             self._active_job.drop()      # an earlier undo may still be computed
-            self._active_job.answer(True, f'{text}; no leg is left')
-            self.show_status()
-            return True, f'{text}; no leg is left'
+            self._active_job.answer(True, text)
+            self._show_no_result()
+            return True, text
 
         def handle(outcome: tuple[Calibration, worker.Paths]) -> None:
             calibration, paths = outcome
@@ -220,18 +220,21 @@ class Operation(AutomaticLegs):
             partial(worker.recombine, remaining, self._config(), self.session.carried), handle)
         return self._active_job.create_future()
 
+    def _show_no_result(self) -> None:
+        self._publishing.set_results(None)
+        self._publishing.show_paths(worker.leg_paths(None, self._config()))
+        self.show_status()
+
     def reset(self) -> tuple[bool, str]:
         if self.session.state is State.FAILED and self.session.has_open_leg:
             self._drop_leg('reset')
         dropped = self.session.begin_reset()
-        self._publishing.forget_restored()
+        self._publishing.restored_results = dict(RESULTS)
         for leg in dropped:  # each is published as undone: a replay of the bag omits it too
             self.session.mark_undone(leg)
             self.show_status()
-        self._publishing.set_results(None)
-        self._publishing.show_paths(worker.leg_paths(None, self._config()))
         self._saver.withdraw(0)
-        self.show_status()
+        self._show_no_result()
         return True, f'reset: {counted(len(dropped), "leg")} dropped'
 
     def save(self) -> Future:

@@ -101,7 +101,12 @@ def declare_settings(node: Node, kind: type = Config) -> Any:
                 array = 'STRING_ARRAY' if setting.kind == 'strs' else 'DOUBLE_ARRAY'
                 node.set_parameters([Parameter(name, Parameter.Type[array], [])])
         except ParameterException as error:
-            raise BadConfig(_refusal(name, setting, error)) from None
+            text = ' '.join(str(error).split()).removesuffix(f': {name}').split('Reason: ')[-1]
+            is_whole = setting.kind in ('float', 'floats') and isinstance(
+                error, InvalidParameterTypeException)
+            remedy = ('write it as a decimal number such as 3.0' if is_whole else
+                      'correct the parameter and restart')
+            raise BadConfig(f'{text}; {remedy}') from None
         values[name] = setting.default if value is None else _python_value(value)
     _warn_of_unknown(node, settings)
     return with_settings(kind(), values)
@@ -224,11 +229,3 @@ def restored_from(results: dict[str, Any],
 def _python_value(value: Any) -> Any:
     """Return a parameter's value, an array as a tuple."""
     return value if value is None or isinstance(value, int | float | str) else tuple(value)
-
-
-def _refusal(name: str, setting: Setting, error: Exception) -> str:
-    """Return the error of rclpy on an override as text, with the action."""
-    text = ' '.join(str(error).split()).removesuffix(f': {name}').split('Reason: ')[-1]
-    if setting.kind in ('float', 'floats') and isinstance(error, InvalidParameterTypeException):
-        return f'{text}; write it as a decimal number such as 3.0'
-    return f'{text}; correct the parameter and restart'

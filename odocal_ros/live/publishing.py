@@ -233,7 +233,7 @@ class Publishing:
         self._paths = [publisher_of(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
         self.setting_results = False      # true while the node itself sets ``result.*``
-        self._restored_results = self.results()      # published while no leg is kept
+        self.restored_results = self.results()      # published while no leg is kept
 
     def results(self) -> dict[str, Any]:
         return {name: self._node.get_parameter(name).value for name in params.RESULTS}
@@ -244,7 +244,7 @@ class Publishing:
 
     def set_results(self, calibration: Calibration | None) -> None:
         """Set all ``result.*`` at once; None: to the restored result, if there is one."""
-        results = self._restored_results
+        results = self.restored_results
         if calibration:
             stamp = date_text(iso(self._node.get_clock().now().nanoseconds))
             results = params.result_values(calibration, stamp,
@@ -255,9 +255,6 @@ class Publishing:
                 [Parameter(name, value=value) for name, value in results.items()])
         finally:
             self.setting_results = False
-
-    def forget_restored(self) -> None:
-        self._restored_results = dict(params.RESULTS)
 
     def show_paths(self, messages: Paths) -> None:
         for publisher, message in zip(self._paths, messages, strict=True):

@@ -192,12 +192,12 @@ class ResultSaver:
                 if unchanged_reason:
                     text += (f'; latest is unchanged: {unchanged_reason}; call ~/save'
                              f'{" again" * by_operator} to point it to this result anyway')
-                future.set_result((True, text))
             else:
                 self.error = answers.error_line(error)
-                future.set_result((False, f'not saved: {self.error}'))
+                text = f'not saved: {self.error}'
             log = self._log.info if error is None else self._log.warning
-            log(future.result()[1])
+            log(text)
+            future.set_result((error is None, text))
             self._show()
 
         self._worker.submit(partial(

@@ -132,11 +132,10 @@ class RunningEstimate:
             partial(self._receive_update, self._stop_event, distance_m))
 
     def _receive_update(self, stop_event: threading.Event, distance_m: float,
-                        result: UpdateResult | None, error: Exception | None) -> None:
+                        result: UpdateResult, _error: None) -> None:
         if stop_event.is_set():
             return
         self._is_updating = False
-        result = result or UpdateResult(error=error)
         self._faults = result.faults
         self._section_forecast = result.forecast and replace(
             result.forecast, distance_m=distance_m)

@@ -97,20 +97,11 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 
 
 class Place(NamedTuple):
-    """Place of a value in a message, or of the first value of a list."""
+    """Place of a value in a message, or of adjacent values of one type, such as a list."""
 
     offset: int      # bytes
     dtype: str       # of numpy
-    length: int = 1  # of the list
-
-
-class AdjacentValues(NamedTuple):
-    """Adjacent values of one type in a message."""
-
-    span: slice                       # their bytes
-    dtype: np.dtype[Any]              # of a value
-    packed_type: np.dtype[Any]        # of all of them as one item, which is copied at once
-    width: int                        # number of values
+    length: int = 1  # number of values
 
 
 @dataclass
@@ -125,7 +116,7 @@ class Layout:
     common_ranges: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
     common_bytes: list[bytes] = field(default_factory=list)
     size: int = 4       # bytes of a message
-    _parts: dict[tuple[str, ...], list[AdjacentValues] | None] = field(default_factory=dict)
+    _places: dict[tuple[str, ...], list[Place] | None] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -147,29 +138,32 @@ class Layout:
             return Place(offset, first.dtype)
         return None
 
-    def _adjacent_values(self, paths: tuple[str, ...]) -> list[AdjacentValues] | None:
-        """Return the values at some paths, adjacent ones joined; None if one is missing."""
-        if paths not in self._parts:
-            self._parts[paths] = _join_adjacent([self.find(path) for path in paths])
-        return self._parts[paths]
+    def _find_joined(self, paths: tuple[str, ...]) -> list[Place] | None:
+        """Return the places of values, adjacent ones joined; None if one is missing."""
+        if paths not in self._places:
+            self._places[paths] = _join_adjacent([self.find(path) for path in paths])
+        return self._places[paths]
 
     def columns(self, table: NDArray[np.uint8], paths: Sequence[str]) -> NDArray[Any] | None:
         """Return values of messages, (n, size) bytes: (n, paths); None if a path is missing."""
-        parts = self._adjacent_values(tuple(paths))
-        if parts is None:
+        places, arrays = self._find_joined(tuple(paths)), []
+        if places is None:
             return None
-        arrays = [table[:, part.span].view(part.packed_type).copy().view(part.dtype).reshape(
-            -1, part.width) for part in parts]
+        for offset, dtype, length in places:
+            size = length * np.dtype(dtype).itemsize
+            # adjacent values are copied at once, as one item
+            items = table[:, offset:offset + size].view(f'V{size}').copy()
+            arrays.append(items.view(dtype).reshape(-1, length))
         return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=1)
 
     def record_type(self, columns: Sequence[Sequence[str] | None]) -> np.dtype[Any] | None:
         """Return a structured type with a field for each column; None if one is not adjacent."""
-        parts = [self._adjacent_values(tuple(paths)) if paths else None for paths in columns]
-        fields = [part[0] for part in parts if part is not None and len(part) == 1]
-        return None if len(fields) < len(parts) else np.dtype({
+        places = [self._find_joined(tuple(paths)) if paths else None for paths in columns]
+        fields = [joined[0] for joined in places if joined is not None and len(joined) == 1]
+        return None if len(fields) < len(places) else np.dtype({
             'names': [str(k) for k in range(len(fields))], 'itemsize': self.size,
-            'formats': [(values.dtype, (values.width,)) for values in fields],
-            'offsets': [values.span.start for values in fields]})
+            'formats': [(place.dtype, (place.length,)) for place in fields],
+            'offsets': [place.offset for place in fields]})
 
     def fits(self, raw: bytes) -> bool:
         """Return True if a message has this layout."""
@@ -189,20 +183,18 @@ def unpackers_of(record_type: np.dtype[Any]) -> list[Unpacker]:
         offset=offset) for dtype, offset, *_ in (record_type.fields or {}).values()]
 
 
-def _join_adjacent(places: Sequence[Place | None]) -> list[AdjacentValues] | None:
-    """Return values at some places, adjacent ones of a type joined; None if one is missing."""
-    joined: list[tuple[slice, str, int]] = []      # bytes, type and number of values
+def _join_adjacent(places: Sequence[Place | None]) -> list[Place] | None:
+    """Return places of single values, adjacent ones of a type joined; None if one is missing."""
+    joined: list[Place] = []
     for place in places:
         if place is None:
             return None
-        span, dtype, count = joined[-1] if joined else (slice(0), '', 0)
-        stop = place.offset + np.dtype(place.dtype).itemsize
-        if dtype == place.dtype and span.stop == place.offset:
-            joined[-1] = slice(span.start, stop), dtype, count + 1
+        last, size = joined[-1] if joined else Place(0, ''), np.dtype(place.dtype).itemsize
+        if last.dtype == place.dtype and last.offset + last.length * size == place.offset:
+            joined[-1] = last._replace(length=last.length + 1)
         else:
-            joined.append((slice(place.offset, stop), place.dtype, 1))
-    return [AdjacentValues(span, np.dtype(dtype), np.dtype((np.void, span.stop - span.start)),
-                           count) for span, dtype, count in joined]
+            joined.append(place)
+    return joined
 
 
 def layout_of(msgtype: str, raw: bytes) -> Layout | None:

@@ -140,7 +140,7 @@ class Reader:
                 for i in np.arange(len(raws))[rows].tolist():
                     row = self._read_row(raws[i], deserialize)
                     has_row[i] = bool(row)
-                    for column, value in zip(columns, row, strict=False):      # or []
+                    for column, value in zip(columns, row, strict=False):      # [] if unreadable
                         column[i] = value
             elif not (values := self._columns_of(layout, table)):
                 has_row[rows] = False

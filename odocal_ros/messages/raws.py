@@ -10,7 +10,7 @@ of them at once. ``FrameFilter`` separates the IMUs that share a topic.
 
 from collections.abc import Callable, Iterator, Sequence
 import struct
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +47,8 @@ class RawMessages(Sequence[bytes]):
     def __len__(self) -> int:
         return len(self.start)
 
-    @overload
-    def __getitem__(self, selection: int) -> bytes: ...
-
-    @overload
-    def __getitem__(self, selection: slice) -> 'RawMessages': ...
-
-    def __getitem__(self, selection: int | slice) -> 'bytes | RawMessages':
+    def __getitem__(self, selection: Any) -> Any:
+        """Return one message as bytes, or those of a slice as RawMessages."""
         if isinstance(selection, slice):
             return self.take(selection)
         start = int(self.start[selection])

@@ -145,6 +145,6 @@ class StaticReader(Reader):
 
 def add_static_readers(readers: Mapping[str, Reader], topics: Container[str]) -> dict[str, Reader]:
     """Return topic -> reader, with readers of the static transforms of TF references."""
-    static_readers = {topic + STATIC: reader.static for topic, reader in readers.items()
-                      if isinstance(reader, TransformReader) and topic + STATIC in topics}
-    return {**readers, **static_readers}
+    return dict(readers) | {
+        topic + STATIC: reader.static for topic, reader in readers.items()
+        if isinstance(reader, TransformReader) and topic + STATIC in topics}
