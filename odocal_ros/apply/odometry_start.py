@@ -83,7 +83,11 @@ def _start_from_settings(row: int, vehicle: Vehicle, config: ApplyConfig, grade:
 
 def _start_by_gravity(row: int, length: float, w: Floats, f: Floats, is_resting: bool,
                       vehicle: Vehicle, grade: Grade) -> Start:
-    """Return the start by gravity, x forward; gyro bias as measured at rest, or calibrated."""
+    """
+    Return the start by gravity, x forward; gyro bias as measured at rest, or calibrated.
+
+    length : s, duration of the samples.   w, f : (n, 3) rad/s, m/s^2 in b.
+    """
     mean = f.mean(axis=0)
     has_gravity = bool(abs(np.linalg.norm(mean) - GRAVITY) < MAX_ACCELERATION)    # False for NaN
     C_Lb = level_frame(mean) if has_gravity else vehicle.C_vb

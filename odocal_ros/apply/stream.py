@@ -73,18 +73,18 @@ class SpikeScreen:
     def __init__(self) -> None:
         self._mean_steps = 0.0, 0.0         # mean ``Step`` from row to row
         self._equal_since = 0.0             # s, start of a run of equal rows
-        self._kept: deque[ImuRow] = deque(maxlen=glitches.NEIGHBOUR_ROWS + 1)
-        self._dropped = False               # a row was dropped since the last kept one
+        self._last_rows: deque[ImuRow] = deque(maxlen=glitches.NEIGHBOUR_ROWS + 1)  # plausible
+        self._has_dropped = False           # a row was dropped after these
         self._step_size = ZERO              # rad/s, implausible step of the gyro, ZERO: none
         self._rate_before = ZERO            # rad/s, rate before the step
         self._implausible_until = 0.0       # s, end of the implausible rates
 
     def screen(self, rows: Sequence[ImuRow]) -> tuple[list[ImuRow], list[ImuRow]]:
         """Return the rows to keep, with their implausible rates, and the rows to hold."""
-        kept, k = [], 0
+        plausible_rows, k = [], 0
         while k < len(rows):
             row = rows[k]
-            last = self._kept[-1] if self._kept else row
+            last = self._last_rows[-1] if self._last_rows else row
             step, isolated = _step(last, row), self._isolated_axes(rows[k:k + 2])
             spike_rows = None      # number of rows after this one until the values are back
             if any(self._exceeds_usual(step)) and not self._step_is_over(row):
@@ -95,26 +95,27 @@ class SpikeScreen:
             if any(isolated) and k + 1 == len(rows) and spike_rows is None:
                 break                  # wait for the next row, which shows whether it is isolated
             self._update_usual_step(step)
-            if any(step) or not any(row.w_b) or not self._kept:      # a gyro may have a dead band
+            # a gyro with a dead band repeats 0
+            if any(step) or not any(row.w_b) or not self._last_rows:
                 self._equal_since = row.t
-            self._dropped = spike_rows is not None or row.t - self._equal_since > FROZEN_TIME
-            if not self._dropped:
+            self._has_dropped = spike_rows is not None or row.t - self._equal_since > FROZEN_TIME
+            if not self._has_dropped:
                 rate = self._implausible_rate(last, row, isolated)
-                kept.append(row if rate is ZERO else row._replace(implausible_rate=rate))
-                self._kept.append(row)
+                plausible_rows.append(row if rate is ZERO else row._replace(implausible_rate=rate))
+                self._last_rows.append(row)
             k += 1 if spike_rows is None else 1 + spike_rows
-        return kept, list(rows[k:])
+        return plausible_rows, list(rows[k:])
 
     def _isolated_axes(self, rows: Sequence[ImuRow]) -> tuple[bool, ...]:
         """Return a mask of gyro axes with an isolated step; a turn starts over several rows."""
-        kept = self._kept
-        if self._dropped or len(kept) <= glitches.NEIGHBOUR_ROWS or (
-                _largest(kept[-1].w_b, rows[0].w_b) <= glitches.SINGLE_RATE):
+        last_rows = self._last_rows
+        if self._has_dropped or len(last_rows) <= glitches.NEIGHBOUR_ROWS or (
+                _largest(last_rows[-1].w_b, rows[0].w_b) <= glitches.SINGLE_RATE):
             return ()
         steps = [[abs(b - a) for a, b in zip(before.w_b, after.w_b, strict=True)]
-                 for before, after in pairwise((*kept, *rows))]
+                 for before, after in pairwise((*last_rows, *rows))]
         current_step = steps.pop(glitches.NEIGHBOUR_ROWS)
-        limit = max(glitches.SINGLE_RATE, ISOLATED_CHANGE * (rows[0].t - kept[-1].t))
+        limit = max(glitches.SINGLE_RATE, ISOLATED_CHANGE * (rows[0].t - last_rows[-1].t))
         return tuple(size > max(limit, glitches.SINGLE_RATIO * max(other_steps))
                      for size, *other_steps in zip(current_step, *steps, strict=True))
 
@@ -155,7 +156,7 @@ class SpikeScreen:
         """Return the number of rows until the values are back after a step, None if never."""
         exceeds = self._exceeds_usual(step)
         for k, row in enumerate(rows):
-            if all(remaining <= glitches.RETURN_SHARE * size for remaining, size, is_large in zip(
+            if all(change <= glitches.RETURN_SHARE * size for change, size, is_large in zip(
                     _step(last, row), step, exceeds, strict=True) if is_large):
                 return k
         return None
@@ -212,7 +213,7 @@ class ImuStream:
         self._offset_ns = round(config.imu.time_offset * 1e9)
         self._notes = notes
         self._screen = SpikeScreen()
-        self._held: list[ImuRow] = []      # rows that may be spikes
+        self._waiting_rows: list[ImuRow] = []      # rows that may be spikes
         self.rows: list[ImuRow] = []
         self.zero_ns = 0
         self.path_row = 0
@@ -221,7 +222,7 @@ class ImuStream:
 
     def feed(self, readings: Sequence[Reading]) -> None:
         """Add rows with rising stamps; possible spikes are held until the next call."""
-        rows, held_count = self._held, len(self._held)
+        rows, waiting_count = self._waiting_rows, len(self._waiting_rows)
         for stamp, _, w_i, f_i, *_ in readings:
             w_b, f_b = rotate_vector(self._gyro, w_i), rotate_vector(self._accel, f_i)
             if not any(f_i) or math.isnan(sum(f_b)):
@@ -230,17 +231,17 @@ class ImuStream:
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
                 rows.append(ImuRow((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
-        self._note_dropped(held_count + len(readings) - len(rows),
+        self._note_dropped(waiting_count + len(readings) - len(rows),
                            f'hold NaN, or exceed {MAX_TURN:g} rad/s or {MAX_FORCE:g} m/s^2')
-        kept, self._held = self._screen.screen(rows)
-        self._note_dropped(len(rows) - len(kept) - len(self._held),
+        plausible_rows, self._waiting_rows = self._screen.screen(rows)
+        self._note_dropped(len(rows) - len(plausible_rows) - len(self._waiting_rows),
                            'jump and return, or repeat one value')
-        for row in kept:
+        for row in plausible_rows:
             self.rows.append(row)
             if len(self.rows) - 2 > self.path_row and is_outlier(self.rows[-OUTLIER_ROWS:]):
                 self._note_dropped(1, 'are isolated outliers')
                 del self.rows[-2]
-        self._new_rows += len(kept)
+        self._new_rows += len(plausible_rows)
         has_few = len(self.rows) < INTERVAL_ROWS
         if len(self.rows) > 1 and (has_few or self._new_rows > INTERVAL_ROWS // 4):
             steps = sorted(b.t - a.t for a, b in pairwise(self.rows[-INTERVAL_ROWS:]))

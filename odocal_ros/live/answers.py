@@ -207,13 +207,13 @@ def _fault_text(view: SessionView) -> str:
 
 def _end_text(view: SessionView) -> str:
     if view.session.is_automatic:
-        remaining = view.session.config.leg.automatic_minutes - view.duration_s / 60
+        remaining_min = view.session.config.leg.automatic_minutes - view.duration_s / 60
         return ('the leg ends automatically at a standstill, or within '
-                f'{max(1, round(remaining))} min')
+                f'{max(1, round(remaining_min))} min')
     if view.still_s < view.session.config.leg.standstill:
         return f'stand still {PREDICTED_REST_S:.0f} s at the end point, then call ~/stop_leg'
-    remaining = seconds_to_stand(view)
-    return (f'stand still {remaining:.0f} s more, then ' if remaining >= 1
+    remaining_s = seconds_to_stand(view)
+    return (f'stand still {remaining_s:.0f} s more, then ' if remaining_s >= 1
             else '') + 'call ~/stop_leg'
 
 

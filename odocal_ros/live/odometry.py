@@ -96,7 +96,7 @@ class OdometryNode(CheckedNode):
                         for slot in ('imu', *wheels)}
         params.check_qos(self, (source.topic for source in self._inputs.values()))
         for source in self._inputs.values():
-            source.subscribe_fixed_type(self.config)
+            source.check_type(self.config)
         frames = self.config.frames
         self._pose = TemplatePublisher(self, 'odometry', OdometryMessage(
             header=Header(frame_id=frames.odom), child_frame_id=frames.base))

@@ -199,12 +199,12 @@ class Operation(AutomaticLegs):
         return True, text
 
     def undo_leg(self) -> tuple[bool, str] | Future:
-        remaining = [result for leg in self.session.begin_undo() for result in leg.results]
+        results = [result for leg in self.session.begin_undo() for result in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
         self._saver.withdraw(self.session.start_ns)
         self.show_status()
-        if not remaining:
+        if not results:
             text += '; no leg is left'
             self._active_job.drop()      # an earlier undo may still be computed
             self._active_job.answer(True, text)
@@ -217,7 +217,7 @@ class Operation(AutomaticLegs):
             self._publish_result(calibration, paths)
 
         self._active_job.submit(
-            partial(worker.recombine, remaining, self._config(), self.session.carried), handle)
+            partial(worker.recombine, results, self._config(), self.session.carried), handle)
         return self._active_job.create_future()
 
     def _show_no_result(self) -> None:

@@ -37,10 +37,12 @@ class Inputs:
         self._node, self._needs_imu = node, config.odometer.needs_imu
         self.by_slot: dict[str, Input] = {}
         for slot, allowed in _used_inputs(config).items():
-            self.by_slot[slot] = Input(node, slot, allowed)
+            source = self.by_slot[slot] = Input(node, slot, allowed)
+            source.check_type(config)
         self._check_reference()
         for source in self.by_slot.values():
-            source.subscribe_fixed_type(config)      # its errors are raised at the start
+            if len(source.allowed_types) == 1:  # one fixed type: errors are raised at the start
+                source.subscribe(source.allowed_types[0], config)
 
     def _check_reference(self) -> None:
         """Refuse one topic as both odometer and reference: its scale would be exactly 1."""

@@ -99,10 +99,11 @@ class Input:
         self.queue = MessageQueue(node)
         self.static_transforms: StaticTransforms | None = None     # second topic of a TF reference
 
-    def subscribe_fixed_type(self, config: Config) -> None:
-        """Subscribe if only one type is allowed; raise OdocalError if it cannot be read."""
+    def check_type(self, config: Config) -> None:
+        """Raise OdocalError at start-up if the one allowed message type cannot be read."""
         if len(self.allowed_types) == 1:
-            self.subscribe(self.allowed_types[0], config)
+            message_class(self.allowed_types[0])
+            make_reader(self.slot, self.allowed_types[0], config)
 
     def search_publishers(self, config: Config) -> None:
         """Update clock and publishers; without messages also suggested topics and the type."""
