@@ -12,9 +12,6 @@ numbers, a quaternion four (x y z w), a matrix three rows.
 from collections.abc import Sequence
 import math
 
-import numpy as np
-
-from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.strapdown import EVEN_RATIO, MIN_INTERVAL
 
 SMALL = 1e-8      # rad; definition: half angle that is equal to its sine in double precision
@@ -66,12 +63,6 @@ def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
 def add_scaled(a: Vector, b: Vector, times: float = 1.0) -> Vector:
     """Return the sum of a vector and a multiple of another."""
     return a[0] + b[0] * times, a[1] + b[1] * times, a[2] + b[2] * times
-
-
-def cross_matrix(a: Sequence[float]) -> Floats:
-    """Return the matrix of the cross product with a vector, (3, 3)."""
-    x, y, z = a
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int) -> Vector:

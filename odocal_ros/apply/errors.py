@@ -15,9 +15,10 @@ import math
 
 import numpy as np
 
-from odocal_ros.apply.attitude import add_scaled, cross_matrix, Matrix, Vector, ZERO
+from odocal_ros.apply.attitude import add_scaled, Matrix, Vector, ZERO
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.nav.rotations import skew
 from odocal_ros.settings.levels import FAULT_SIGMAS
 from odocal_ros.settings.nominal import Grade
 
@@ -102,7 +103,7 @@ class Errors:
                    travel_variance: float, gaps: Sequence[float]) -> None:
         """Propagate the covariance over an interval; arguments as ``add_interval``."""
         F, axes_n = EYE.copy(), C_nb @ self._C_bv      # columns forward, left, up
-        cross = cross_matrix(travel_n)
+        cross = skew(travel_n)
         F[P, PHI], F[P, K], F[P, M] = -cross, travel_n, -cross @ C_nb[:, 1:]
         F[PHI, BG], F[PHI, G] = C_nb * -T, add_scaled(ZERO, turn_n, -1.0)
         F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
@@ -191,7 +192,7 @@ class Errors:
         """
         J = POSE_JACOBIAN.copy()
         J[3:, M] = [row[1:] for row in C_nb]
-        J[:3, 3:] = -cross_matrix(arm_n) @ J[3:, 3:]
+        J[:3, 3:] = -skew(arm_n) @ J[3:, 3:]
         pose = J @ self.cov @ J.T
         pose[:3, :3] += np.outer(self.shortening, self.shortening)
         # rotations about two axes cause half their product about the third

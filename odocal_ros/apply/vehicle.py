@@ -8,12 +8,12 @@ import math
 
 import numpy as np
 
-from odocal_ros.apply.attitude import cross, cross_matrix, rotate_vector, Vector
+from odocal_ros.apply.attitude import cross, rotate_vector, Vector
 from odocal_ros.calib.result import Estimate
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
 from odocal_ros.nav.dead_reckoning import forward_b
-from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix
+from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, skew
 from odocal_ros.settings.node_configs import ApplyConfig
 
 # rad, 1 sigma of angles without a calibration; judgement: 5 and 3 deg of mounting by eye
@@ -46,8 +46,7 @@ class Vehicle:
         self.C_vb = matrix_from_rpy([0.0, self.pitch, self.yaw])
         self.q_bv = quat_from_matrix(self.C_vb.T)
         self.arm_b = -self.C_vb.T @ self.lever_arm
-        self.twist_b = np.concatenate([
-            cross_matrix(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
+        self.twist_b = np.concatenate([skew(self.lever_arm), np.eye(3)]) @ self.C_vb
 
     def twist_by_turn(self, rate_b: Vector) -> tuple[float, ...]:
         """Return ``twist_b`` times a turn rate in b, rad/s: (6,) m/s, rad/s, as numbers."""
