@@ -3,6 +3,8 @@
 
 """Checks of the drive: length, speed, straightness, and motion of wheels and fixes."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
@@ -63,13 +65,13 @@ def check_path_and_speed(track: Track, t_stop: float, metres_per_unit: float,
 
 
 def speed_reason(top_speed: float, limit: float) -> Reason:
-    """Return SPEED_TOO_LOW of a highest mean speed over 1 s and its limit, m/s."""
+    """Return SPEED_TOO_LOW for a highest speed, mean over 1 s, and its limit, m/s."""
     return Reason(Code.SPEED_TOO_LOW, f'the highest speed (mean over 1 s) is {top_speed:.2f} m/s; '
                   f'the limit is {limit:g} m/s')
 
 
 def rate_over_second(t: Floats, x: Floats) -> Floats:
-    """Return the rate of x by time over one second about each row: (m,), zero of a single row."""
+    """Return the mean rate of x, (m,), in the second around each row: (m,), 0 of a single row."""
     if len(t) < 2:
         return np.zeros(len(t))
     low, high = np.maximum(t - 0.5, t[0]), np.minimum(t + 0.5, t[-1])
@@ -134,18 +136,26 @@ def motion_reasons(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: fl
 def _stopped_counter_reasons(travel: Travel, t: Floats, fixes: Floats,
                              fix_sigma: float) -> tuple[Reason, ...]:
     """Return a reason if the fixes, (k, 2) at (k,) s, move far without counts."""
-    distance, begin, end = max(_motion_without_counts(travel, t, fixes, fix_sigma),
-                               default=(0.0, 0.0, 0.0))
-    if not distance or distance < MIN_UNCOUNTED_SHARE * path_and_chord(t, fixes)[0]:
+    motion = max(_motion_without_counts(travel, t, fixes, fix_sigma), default=None)
+    if motion is None or motion.distance < MIN_UNCOUNTED_SHARE * path_and_chord(t, fixes)[0]:
         return ()
-    return (Reason(Code.ODOMETER_STILL, f'the fixes move by {distance:.0f} m from t = {begin:.0f} '
-                   f's to {end:.0f} s, but the odometer does not count'),)
+    return (Reason(Code.ODOMETER_STILL, f'the fixes move by {motion.distance:.0f} m from '
+                   f't = {motion.begin:.0f} s to {motion.end:.0f} s, but the odometer does not '
+                   'count'),)
+
+
+class UncountedMotion(NamedTuple):
+    """Motion of the fixes in an interval in which the odometer does not count."""
+
+    distance: float    # m
+    begin: float       # s
+    end: float         # s
 
 
 def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
-                           fix_sigma: float) -> list[tuple[float, float, float]]:
-    """Return motion of the fixes, m, begin and end, s, of each interval without counts."""
-    counts = np.flatnonzero(np.diff(travel.s))
+                           fix_sigma: float) -> list[UncountedMotion]:
+    """Return the intervals without counts in which the fixes, (k, 2) m at (k,) s, move."""
+    counts = np.flatnonzero(np.diff(travel.s))      # rows before a count
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
     motions = []
@@ -156,7 +166,7 @@ def _motion_without_counts(travel: Travel, t: Floats, fixes: Floats,
         motion_limit = max(MIN_GNSS_MOTION if is_no_slide else SLIDE_DISTANCE, 10 * fix_sigma)
         distance = _motion_of_fixes(fixes[(t >= begin[k]) & (t <= end[k])], motion_limit)
         if distance >= motion_limit:
-            motions.append((distance, begin[k], end[k]))
+            motions.append(UncountedMotion(distance, begin[k], end[k]))
     return motions
 
 
@@ -172,12 +182,13 @@ def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: f
         rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))
         if end >= travel.t[-1]:
             continue
-        t, p = t_fix[rows], fixes_n[rows, :2]
+        t, positions = t_fix[rows], fixes_n[rows, :2]
         # at most a quarter of the distance: with noisy fixes, both ends remain two places
         limit = min(max(MIN_LOCAL_MOTION, 10 * fix_sigma), distance / 4)
         # the places are medians of three fixes, of which one may be an outlier
-        is_after_start, is_before_end = (np.hypot(*(p - np.median(place, axis=0)).T) > limit
-                                         for place in (p[:3], p[-3:]))
+        is_after_start, is_before_end = (
+            np.hypot(*(positions - np.median(place, axis=0)).T) > limit
+            for place in (positions[:3], positions[-3:]))
         last = len(t) - 1 - np.argmax(is_before_end[::-1])
         spans.append((t[np.argmax(is_after_start)], t[last]))
     return np.reshape(np.array(spans, float), (-1, 2))
@@ -188,10 +199,9 @@ def _motion_of_fixes(fixes: Floats, motion_limit: float) -> float:
     part_count = 20      # so many that motion extends over more than two of them
     if len(fixes) < part_count:
         return 0.0
-    parts = np.array_split(fixes, part_count)
-    if np.hypot(*(np.median(parts[-1], axis=0) - np.median(parts[0], axis=0))) < motion_limit:
+    middle = np.array([np.median(part, axis=0) for part in np.array_split(fixes, part_count)])
+    if np.hypot(*(middle[-1] - middle[0])) < motion_limit:
         return 0.0
-    middle = np.array([np.median(part, axis=0) for part in parts])
     steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
     # a jump is one step, or two if inside a part: limit steps to the third largest
     return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
@@ -200,7 +210,7 @@ def _motion_of_fixes(fixes: Floats, motion_limit: float) -> float:
 def path_and_chord(t_fix: Floats, fixes_n: Floats,
                    min_distance: float = MIN_GNSS_MOTION) -> tuple[float, float]:
     """
-    Return path length and distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
+    Return path length and distance between the ends, m, from (k, 2 or more) fixes at (k,) s.
 
     The path connects fixes at least ten times their white noise, and ``min_distance`` or 2 m,
     apart, so that noise does not accumulate. Fixes out of reach of a vehicle are left out.
@@ -232,10 +242,10 @@ def find_reachable(t_fix: Floats, fixes_n: Floats) -> Bools:
 
 
 def fix_white_noise(fixes_n: Floats) -> float:
-    """Return the white noise of fixes, m, by the median of their second differences."""
+    """Return the white noise of fixes, 1 sigma, m, from the median of second differences."""
     if len(fixes_n) < 5:
         return 2.5      # m, of a receiver without corrections
-    second_difference = np.diff(fixes_n[:, :2], n=2, axis=0)     # with 1 + 4 + 1 variances
+    second_difference = np.diff(fixes_n[:, :2], n=2, axis=0)     # has 1 + 4 + 1 variances
     return float(np.median(np.abs(second_difference)) / (NORMAL_MEDIAN * np.sqrt(6)))
 
 

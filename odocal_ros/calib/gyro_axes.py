@@ -27,22 +27,23 @@ from odocal_ros.screening.imu_orientation import ImuOrientation
 from odocal_ros.screening.inputs import Inputs, LocatedFixes
 from odocal_ros.settings.levels import RAD_PER_DEG
 
-# definition: coefficients of ``gravity_fit`` of correct axes, and of mirrored or swapped ones
-CORRECT = np.array([1.0, 1j, 0.0])
-WRONG = np.array([1.0, -1.0, 1j, -1j])
+# definition: coefficients of ``gravity_fit`` for correct e1, e2 and up axes of the gyro; and those
+# of an axis that is mirrored (negative) or measures the rotation about e1 (real) or e2 (imaginary)
+CORRECT_COEFFICIENTS = np.array([1.0, 1j, 0.0])
+WRONG_COEFFICIENTS = np.array([1.0, -1.0, 1j, -1j])
 # statistical: largest chance of a correct axis, and distance from a wrong one; both must hold.
 # False alarms in 0 of 384 zoo drives (lowest chance 1.9e-4); zoo.md
-LARGEST_CHANCE, NEAR_WRONG = 5e-5, 0.4
+MAX_CHANCE, MAX_DEVIATION = 5e-5, 0.4
 # the ratio ``ImuOrientation.centripetal``, 1 if correct: statistical, sigmas of a certain sign;
-# judgement, limit of an inverted one (a vehicle that leans into its turns has 0)
-FAR_SIGMAS, INVERTED = 5.0, -0.5
-# statistical: least correlation of the same turns by gyro and by course, and least sigmas of the
-# slope, since a few courses may be correlated by chance
-SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
+# judgement, limit below which it is inverted (a vehicle that leans into its turns has 0)
+SIGN_SIGMAS, INVERTED_RATIO = 5.0, -0.5
+# statistical: least correlation of the turns by gyro and by course, and least sigmas of their
+# ratio, since a few courses may be correlated by chance
+MIN_CORRELATION, SLOPE_SIGMAS = 0.9, 8.0
 LONGEST_GAP = 1.0      # s, judgement: of the IMU, turns within a longer one are not measured
 # rad^2, judgement: a chord with a U-turn in it, and the next, are off by 0.35 rad each (0.1 to 0.2
 # for a mower whose rows are 1.6 m apart)
-U_TURN = 0.25
+U_TURN_ERROR = 0.25
 NO_ROTATION = 'imu.mounting_rpy cannot correct this: it rotates gyro and accelerometer together.'
 
 
@@ -51,7 +52,7 @@ class WrongAxis(NamedTuple):
 
     published: str    # such as 'x'
     true: str         # with its sign, such as '-y'
-    text: str         # statement of what was observed
+    text: str         # what was observed, for the reason
 
 
 def level_axes(up: Floats) -> tuple[Floats, list[str]]:
@@ -67,7 +68,7 @@ def level_axes(up: Floats) -> tuple[Floats, list[str]]:
 
 def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientation | None,
                 gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
-    """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
+    """Return the ratio of turns by gyro to those by fixes, None if unknown, and reasons."""
     ratio = turn_ratio(inputs.t_imu, map_rows(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.min_motion)
     reasons = gyro_reasons(ratio, gyro_scale)
@@ -75,7 +76,7 @@ def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientati
         return ratio, wrong_axis_reasons(inputs, located, orientation) or reasons
     text = reasons[0].text
     if orientation and abs(orientation.centripetal) > max(
-            -INVERTED, FAR_SIGMAS * orientation.centripetal_sigma):
+            -INVERTED_RATIO, SIGN_SIGMAS * orientation.centripetal_sigma):
         text += (', and to the accelerations in turns: angular_velocity has the wrong sign'
                  if orientation.centripetal < 0 else ', but match the accelerations in turns: '
                  'latitude and longitude (x and y) are swapped, or linear_acceleration is negated')
@@ -88,7 +89,7 @@ def wrong_axis_reasons(inputs: Inputs, located: LocatedFixes,
     """
     Return a reason if an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
-    located : the fixes in metres and approximate scale.   orientation : fit of the accelerations.
+    located : the fixes in metres and approximate scale.   orientation : from the accelerations.
     A flat road does not show roll and pitch, a straight one no yaw.
     """
     w_i, f_i = (map_rows(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
@@ -96,12 +97,12 @@ def wrong_axis_reasons(inputs: Inputs, located: LocatedFixes,
     axes, names = level_axes(up / np.linalg.norm(up))
     wrong_axes = wrong_axes_by_course(inputs, located, w_i, axes, names)
     if not wrong_axes and inputs.has_accelerometer:
-        inverted = orientation and orientation.centripetal < min(
-            INVERTED, -FAR_SIGMAS * orientation.centripetal_sigma)
-        if inverted:            # the yaw rate, with the sign determined by the accelerometer
+        is_inverted = orientation and orientation.centripetal < min(
+            INVERTED_RATIO, -SIGN_SIGMAS * orientation.centripetal_sigma)
+        if is_inverted:     # invert the yaw rate: then it matches the accelerometer
             w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
         wrong_axes = wrong_axes_by_gravity(inputs, located, w_i, f_i, axes, names)
-        if orientation and inverted:
+        if orientation and is_inverted:
             return _inverted_turns(orientation, wrong_axes, names)
     if not wrong_axes:
         return ()
@@ -120,20 +121,19 @@ def _inverted_turns(orientation: ImuOrientation, wrong_axes: list[WrongAxis],
     """Return the reason for accelerations to the outside of turns."""
     text = ('accelerations in turns are opposite to turn rate and speed (ratio '
             f'{orientation.centripetal:.2f} ± {orientation.centripetal_sigma:.1g}, expected: 1)')
-    level = [name[-1] for name in names[:2]]
+    level_names = [name[-1] for name in names[:2]]
     # a mirrored level axis of the accelerometer makes the other level axis of the gyro look wrong
-    wrong = [axis for axis in level
-             if len(wrong_axes) == 1 and wrong_axes[0][:2] != (axis, '-' + axis)]
-    if len(wrong) == 1:
+    mirrored = [axis for axis in level_names
+                if len(wrong_axes) == 1 and wrong_axes[0][:2] != (axis, '-' + axis)]
+    if len(mirrored) == 1:
         return (Reason(Code.IMU_AXES, f'{text}. Gravity rotates about '
                        f'{wrong_axes[0].published} opposite to the gyro: '
-                       f'linear_acceleration.{wrong[0]} has the wrong sign',
-                       f'Correct the IMU driver: negate linear_acceleration.{wrong[0]}. '
+                       f'linear_acceleration.{mirrored[0]} has the wrong sign',
+                       f'Correct the IMU driver: negate linear_acceleration.{mirrored[0]}. '
                        + NO_ROTATION),)
     return (Reason(Code.GYRO_SIGN, f'{text}: the sign of angular_velocity.{names[2][-1]}, or of '
-                   f'linear_acceleration.{level[0]} or {level[1]}, is wrong',
-                   'Correct the sign in the IMU driver. imu.mounting_rpy cannot: it rotates gyro '
-                   'and accelerometer together.'),)
+                   f'linear_acceleration.{level_names[0]} or {level_names[1]}, is wrong',
+                   f'Correct the sign in the IMU driver. {NO_ROTATION}'),)
 
 
 def wrong_axes_by_course(inputs: Inputs, located: LocatedFixes, w_i: Floats, axes: Floats,
@@ -167,25 +167,26 @@ def wrong_axes_by_gravity(inputs: Inputs, located: LocatedFixes, w_i: Floats, f_
     if fit is None:
         return []
     wrong_axes = []
-    nearest = WRONG[np.abs(WRONG - fit.coefficient[:, None]).argmin(axis=1)]
-    is_close = np.abs(nearest - fit.coefficient) < NEAR_WRONG
+    distance = np.abs(WRONG_COEFFICIENTS - fit.coefficient[:, None])
+    nearest = WRONG_COEFFICIENTS[distance.argmin(axis=1)]
+    is_close = np.abs(nearest - fit.coefficient) < MAX_DEVIATION
     about_e1 = nearest.imag == 0      # else about e2
     for k, c in enumerate(fit.coefficient):
         # two gyro axes that measure one axis are no mirrored or swapped ones
-        if (nearest[k] == CORRECT[k] or not is_close[k]
+        if (nearest[k] == CORRECT_COEFFICIENTS[k] or not is_close[k]
                 or (is_close & (about_e1 == about_e1[k])).sum() > 1
-                or fit.chance(k, CORRECT[k]) > LARGEST_CHANCE):
+                or fit.chance(k, CORRECT_COEFFICIENTS[k]) > MAX_CHANCE):
             continue
-        measured, part = (names[0], c.real) if about_e1[k] else (names[1], c.imag)
-        published, true = _published_and_true(names[k], measured, float(part))
+        measured, coefficient = (names[0], c.real) if about_e1[k] else (names[1], c.imag)
+        published, true = _published_and_true(names[k], measured, float(coefficient))
         wrong_axes.append(WrongAxis(
             published, true, f'angular_velocity.{published} measures the rotation of gravity '
-            f'about {true} (coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
+            f'about {true} (coefficient {abs(coefficient):.2f} ± {fit.sigma[k]:.2f})'))
     return wrong_axes
 
 
 def _published_and_true(published: str, measured: str, ratio: float) -> tuple[str, str]:
-    """Return an axis without its sign, and the measured axis with the sign that it has then."""
+    """Return an axis without its sign, and the measured axis with the sign relative to it."""
     minus = (ratio < 0) ^ published.startswith('-') ^ measured.startswith('-')
     return published[-1], '-' * minus + measured[-1]
 
@@ -197,8 +198,9 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
 
     Mean yaws over chords between fixes are fitted to their courses.
 
-    t_imu, w_up : (n,) s, and turn rate about the upward axis.   t_fix, fixes_n, sigma : (k,), (k,
-    2 or more), float s, m, and m horizontally.   min_motion : of the fixes, m.
+    t_imu, w_up : (n,) s, and turn rate about the upward axis, rad/s.   t_fix, fixes_n : (k,) s,
+    (k, 2 or more) m.   sigma : of a fix, horizontally, m.   min_motion : distance between fixes
+    that is motion, m.
     """
     inside = (t_fix >= t_imu[0]) & (t_fix <= t_imu[-1])      # turns outside are not measured
     t_fix, fixes_n = t_fix[inside], fixes_n[inside]
@@ -222,18 +224,18 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     # the mean angle over each chord; the effect of a bias is linear in time
     gyro = (np.diff(double_integral_at(ends, t_imu, w_up)) / np.diff(ends))[keep]
     # at a sudden U-turn of the course the vehicle may have reversed, and the turn in a gap of the
-    # IMU is unknown: a free step is fitted there
+    # IMU is unknown: a free step of the yaw is fitted there
     restarts = np.flatnonzero((np.abs(np.diff(course)) > 2.0) | (np.diff(ended[1:][keep]) > 0))
     drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > restarts])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)
     # rad^2: turns of 1 rad in total, root sum of squares, plus the error of chords at U-turns
-    if course @ course < 1.0 + U_TURN * len(restarts) or power == 0:
+    if course @ course < 1.0 + U_TURN_ERROR * len(restarts) or power == 0:
         return None
-    slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
+    slope = float(course @ gyro / power)      # of the noisy course on the clean gyro: no bias
     explained = slope**2 * power / (course @ course)      # share of the course's variance
-    certain = explained * (len(t) - 1 - drift.shape[1]) > SLOPE_SIGMAS**2 * (1 - explained)
-    return 1 / slope if explained > SAME_TURNS**2 and certain else None
+    is_certain = explained * (len(t) - 1 - drift.shape[1]) > SLOPE_SIGMAS**2 * (1 - explained)
+    return 1 / slope if explained > MIN_CORRELATION**2 and is_certain else None
 
 
 def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
@@ -243,14 +245,13 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
     if ratio < -PLAUSIBLE_RATIO[0]:
         return (Reason(Code.GYRO_SIGN, 'turns measured by the gyro are opposite to those of '
                        f'the fixes (ratio {ratio:.2f}, expected: 1)'),)
-    degrees = 40.0 < ratio < 80.0       # 180 / pi, with a margin for scale errors and skid
     if abs(ratio) < 0.01:       # no error of the unit: revolutions give 0.16
         return (Reason(Code.IMU_UNITS, f'turns measured by the gyro are only {ratio:#.2g} times '
                        'those of the fixes (expected: 1)', 'Set imu.mounting_rpy if another IMU '
                        'axis is vertical; otherwise correct the IMU driver.'),)
     text = (f'turns measured by the gyro are {ratio:#.3g} times those of the fixes (limits '
             f'{PLAUSIBLE_RATIO[0]:g} and {PLAUSIBLE_RATIO[1]:g})')
-    if degrees:
+    if 40.0 < ratio < 80.0:     # 180 / pi, with a margin for scale errors and skid
         return (Reason(Code.IMU_UNITS, text + ', typical for deg/s',
                        f'Set imu.gyro_scale to {gyro_scale * RAD_PER_DEG:.10g}, or publish rad/s '
                        '(REP-145).'),)

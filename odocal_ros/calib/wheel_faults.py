@@ -46,7 +46,7 @@ class Event(NamedTuple):
 
 
 class Window(NamedTuple):
-    """Steps of the mean residual over windows of one length, which begin at each row: (n,)."""
+    """Jumps of the mean residual over windows of one length, which begin at each row: (n,)."""
 
     span: int            # rows from the first to the last mean
     jump: Floats         # (n,) m, last mean minus first mean
@@ -75,15 +75,16 @@ def wheel_faults(axle: Sequence[Travel], imu: ImuRows, t_stop: float, track: Tra
     fit = regression.fit_right_path(pair, regressors, metres_per_unit)
     if fit is None:
         return (), slip.NO_SLIPS
-    x, covariance = fit
-    ratio = x[0]                                          # right counts over left ones
-    per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
-    width = track_width or abs(x[1]) * per_right
-    reasons = regression.side_reasons(pair, x[1] * per_right,
-                                      np.sqrt(covariance[1, 1]) * per_right, track_width)
+    coefficients, covariance = fit
+    ratio = coefficients[0]                                 # right counts over left ones
+    right_scale = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
+    fitted_width, width_sigma = coefficients[1] * right_scale, np.sqrt(
+        covariance[1, 1]) * right_scale                     # m
+    width = track_width or abs(fitted_width)
+    reasons = regression.side_reasons(pair, fitted_width, width_sigma, track_width)
     reasons += regression.counter_reasons(pair, ratio, width, max_deviation)
-    residual = (pair.right - regressors @ x) * per_right
-    events, slow_events = _find_events(pair, residual, per_right * (1 + ratio) / 2, width)
+    residual = (pair.right - regressors @ coefficients) * right_scale
+    events, slow_events = _find_events(pair, residual, right_scale * (1 + ratio) / 2, width)
     change_reasons, change = regression.find_ratio_change(
         _without_slips(pair, events), regressors, metres_per_unit, wheel_count)
     reasons += change_reasons
@@ -94,9 +95,10 @@ def wheel_faults(axle: Sequence[Travel], imu: ImuRows, t_stop: float, track: Tra
         events = [event for event in events if abs(_slope(pair, event)) > steep]
     if not events:
         return reasons, replace(slip.NO_SLIPS, change=change)
-    mean = (pair.left * ratio + pair.right) / 2 * per_right
+    mean_path = (pair.left * ratio + pair.right) / 2 * right_scale
     begin, end, size = np.transpose(events)
-    wheel = np.array([_find_wheel(pair, mean, imu, track, latitude, event) for event in events])
+    wheel = np.array([_find_wheel(pair, mean_path, imu, track, latitude, event)
+                      for event in events])
     # if the left wheel spins, right minus left is negative
     slips = slip.WheelSlips(begin, end, np.where(wheel < 0, -size, size), wheel, change)
     return reasons + slip.wheel_slip_reason(slips, pair.names), slips
@@ -127,8 +129,8 @@ def _without_slips(pair: WheelPair, events: list[Event]) -> WheelPair:
 def _find_events(pair: WheelPair, residual: Floats, quantum_m: float,
                  width: float) -> tuple[list[Event], list[Event]]:
     """Return the steps of the residual, (n,) m, that end, and those that may change the ratio."""
-    # a step is a jump between two means of the residual, with several gaps between them, that is
-    # larger than by chance. quantum_m, width : size of a count, track width, m
+    # a step is a jump between two means of the residual, larger than by chance; the time between
+    # the means is one of SLIP_SPANS. quantum_m, width : size of a count, track width, m
     residual = _without_slope(pair, residual, quantum_m)
     total = running_sum(residual)
     mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
@@ -177,7 +179,7 @@ def _slope(pair: WheelPair, event: Event) -> float:
 
 
 def _mean_path(pair: WheelPair) -> Floats:
-    """Return the path length of the mean of both wheels, scale units: (n,)."""
+    """Return the path length of the mean of both wheels up to each edge, scale units: (n,)."""
     return running_sum(np.abs(np.diff(pair.left + pair.right)) / 2)
 
 
@@ -190,8 +192,8 @@ def _jump_limits(pair: WheelPair, jump: Floats, span: int, quantum_m: float,
     distance = path[ends:][:n] - path[:n]
     scatter = np.zeros(n)
     if (distance > 0).any():
-        usual = robust_sigma(jump[distance > 0])
-        scatter = usual * np.maximum(1.0, distance / np.median(distance[distance > 0]))
+        noise = robust_sigma(jump[distance > 0])
+        scatter = noise * np.maximum(1.0, distance / np.median(distance[distance > 0]))
     turn = TURN_SHARE * width * (total_turn[ends:][:n] - total_turn[:n])
     counts = (path[MEAN_STEPS - 1:] - path[:len(path) - MEAN_STEPS + 1]) / max(pair.quantum, 1e-9)
     rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, MEAN_STEPS)
@@ -226,12 +228,11 @@ def _measure_event(pair: WheelPair, residual: Floats, windows: list[Window], beg
                  float(pair.t[first + max(last_low, first_high)]), size)
 
 
-def _find_wheel(pair: WheelPair, mean: Floats, imu: ImuRows, track: Track,
+def _find_wheel(pair: WheelPair, mean_path: Floats, imu: ImuRows, track: Track,
                 latitude: float, event: Event) -> int:
     """Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it."""
-    # a slip of the right wheel by x moves the mean path of the wheels, m, by x / 2 relative to the
-    # IMU, one of the left by -x moves it by -x / 2; the noise is the difference of mean and IMU
-    # elsewhere
+    # a slip of the right wheel by x moves the mean path of the wheels, (n,) m, by x / 2 relative
+    # to the IMU, one of the left by -x moves it by -x / 2; the noise is their difference elsewhere
     begin, end, size = event
     grid = np.arange(max(track.t[0], pair.t[0]), min(track.t[-1], pair.t[-1]), slip.EXCESS_GRID)
     margin = 1.0        # s each side of a slip, in which speeds are set equal
@@ -239,7 +240,7 @@ def _find_wheel(pair: WheelPair, mean: Floats, imu: ImuRows, track: Track,
     if len(grid) < 3 * span:
         return 0
     a = slip.acceleration(grid, imu.t, imu.f_b, track, np.array([1.0, 0.0, 0.0]), latitude)
-    excess = slip.excess_path(span, a, np.interp(grid, pair.t, mean))
+    excess = slip.excess_path(span, a, np.interp(grid, pair.t, mean_path))
     turn = np.interp(grid, pair.t, pair.turn)[slip.END_STEPS:-slip.END_STEPS]
     straight = np.abs(turn[span:] - turn[:-span]) < slip.MAX_WINDOW_TURN
     window = int(np.searchsorted(grid, (begin + end) / 2)) - slip.END_STEPS - span // 2
