@@ -47,7 +47,7 @@ COMPARED = {
 
 def deciding_methods(method_setting: str | tuple[str, ...],
                      compared: bool = False) -> tuple[str, ...]:
-    """Return the methods that may give the result, best first; compared: and those to compare."""
+    """Return the methods that may give the result, best first; compared: also ALWAYS_COMPUTED."""
     if not isinstance(method_setting, str):
         return method_setting
     if method_setting in ('auto', 'all'):
@@ -64,7 +64,8 @@ def choose(methods: Mapping[str, MethodResult],
 
     Also returns the names of the methods that gave a value; if none did, the name of the first
     usable one.
-    methods : by name.   method_setting : the setting ``method``, or the methods.
+
+    methods : by name.   method_setting : the setting ``method``, or the names of methods.
     """
     results = [methods[name] for name in dict.fromkeys((*deciding_methods(method_setting), PLANAR))
                if name in methods]
@@ -115,8 +116,8 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
 
     They differ by more than REMARK_SIGMAS of both together; a rejected method is not compared.
     """
-    usable = [methods[n] for n in METHOD_ORDER if n in methods
-              and methods[n].verdict is not Verdict.REJECTED]
+    usable = [methods[name] for name in METHOD_ORDER if name in methods
+              and methods[name].verdict is not Verdict.REJECTED]
     if len(usable) < len(METHOD_ORDER):
         return []
     (first, second), reasons = usable, []
@@ -126,8 +127,9 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
                 or a.sigma is None or b.sigma is None:
             continue
         sigma = math.hypot(a.sigma, b.sigma)
-        difference = b.value - a.value if name == 'scale_factor' else float(wrap(b.value
-                                                                                 - a.value))
+        difference = b.value - a.value
+        if name != 'scale_factor':
+            difference = float(wrap(difference))
         if abs(difference) > REMARK_SIGMAS * sigma:
             text = (format_change(difference / a.value) if name == 'scale_factor' else
                     f'{math.degrees(difference):+z.3f} deg')

@@ -50,9 +50,9 @@ class Evidence:
     sections: Sections
     t_excluded: Floats                 # (x,) fixes not used
     excluded_because: tuple[str, ...]  # (x,)
-    fixes: int                         # their number before decimation
+    fixes: int                         # number of fixes before decimation
     excluded: int                      # number of fixes not used, before decimation
-    gaps: tuple[tuple[str, float, float], ...] = ()  # of IMU and odometer: which, begin, end
+    gaps: tuple[tuple[str, float, float], ...] = ()  # 'IMU' or 'odometer', begin and end, s
     t_fit: float = np.inf              # later data are held out of the fit
     by_speed: SpeedScale = SpeedScale(NO_BINS)  # of the uncorrected odometer
     by_window: Floats = field(default_factory=lambda: NO_WINDOWS)     # (w, 4) ``window_scale``
@@ -84,6 +84,7 @@ def make_evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept:
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     status, t_excluded, causes = _fix_states(leg, inputs, kept, span, config)
 
+    # shown rows of track, fixes and excluded fixes
     m, k, x = (_decimated_rows(n) for n in (len(t), len(t_fix), len(causes)))
     return Evidence(
         t=t[m], distance=distance[m], speed=(rate_over_second(t, distance) * sign)[m],

@@ -71,10 +71,10 @@ def fit_jointly(marginals: Sequence[MarginalInformation], steps: Sequence[float]
         legs, [name for name in nonlinear if name in legs.names])
     chi2, freedom = legs.disagreement()
     drives = legs.combine_sections(same_drive)
-    estimated = _estimate_scatter(drives, usual_scatter)
+    estimated_scatter = _estimate_scatter(drives, usual_scatter)
     # a single leg has no scatter
     is_single = len(drives.marginals) == 1 and not marginals[0].scatter_likelihood
-    scatter = {} if is_single else estimated.sigmas
+    scatter = {} if is_single else estimated_scatter.sigmas
     # chi-square of the drives with scatter, plus that of their sections about each drive
     residual_chi2, residual_freedom = (
         with_scatter + all_legs - all_drives for with_scatter, all_legs, all_drives in zip(
@@ -83,8 +83,9 @@ def fit_jointly(marginals: Sequence[MarginalInformation], steps: Sequence[float]
     factor = float(np.sqrt(residual_chi2 / residual_freedom)) if disagree else 1.0
     last = drives.indices(len(drives.marginals) - 1)
     x, C = drives.solve() if is_single else _average_over_scatter(
-        drives, estimated, usual_scatter)
-    information = drives.combined_information(x[last], estimated.sigmas, estimated.likelihood)
+        drives, estimated_scatter, usual_scatter)
+    information = drives.combined_information(x[last], estimated_scatter.sigmas,
+                                              estimated_scatter.likelihood)
     return JointEstimate(
         legs.names, x[last], C[np.ix_(last, last)] * factor**2, legs.prior_sigma,
         legs.relaxed_sigma, chi2, freedom, legs.deviations(), information.widened(factor),
@@ -115,10 +116,11 @@ def _estimate_scatter(legs: LinkedLegs, usual_scatter: Mapping[str, float]) -> S
     fine_grid = np.linspace(SCATTER_GRID[0], SCATTER_GRID[-1], 301)
     for _ in range(2):      # sweeps: the scatter of one hardly depends on that of another
         for name, usual in usual_scatter.items():
-            log = np.array([legs.log_likelihood({**sigmas, name: usual * float(np.exp(x))})
-                            for x in SCATTER_GRID])
+            log_likelihood = np.array([
+                legs.log_likelihood({**sigmas, name: usual * float(np.exp(x))})
+                for x in SCATTER_GRID])
             # legs combined earlier have the likelihood of their scatter
-            likelihood[name] = log - log.max() + sum(
+            likelihood[name] = log_likelihood - log_likelihood.max() + sum(
                 (leg.scatter_likelihood[name] for leg in legs.marginals
                  if name in leg.scatter_likelihood), np.zeros(SCATTER_POINTS))
             posterior = CubicSpline(SCATTER_GRID, likelihood[name])(fine_grid)

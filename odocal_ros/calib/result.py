@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Results: estimates with sigmas and units, per method, per leg and combined; exceptions."""
+"""Results: estimates with sigmas and units, of a method, of a leg, and of all legs combined."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -21,8 +21,8 @@ NOT_ESTIMATES = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
                            'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
                            'pitch_mounting_angle_housing_sigma'})
 AS_SENT = 'scale_factor_as_sent'     # of speeds as published, without the correction of steps
-FACTOR = 'scale_factor_'      # format: prefix of the name of a wheel in the name of its factor
-TRACE = 'trace'      # key in the details of a method that raised an exception: its traceback
+WHEEL_PREFIX = 'scale_factor_'     # format: before the name of a wheel
+TRACE = 'trace'      # format: key in the details of a method that raised an exception: traceback
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def unknown_values(scale_unit: str) -> dict[str, Estimate]:
 
 def wheel_factors(estimates: Iterable[str]) -> list[str]:
     """Return the names of the scale factors of single wheels."""
-    return [name for name in estimates if name.startswith(FACTOR) and name != AS_SENT]
+    return [name for name in estimates if name.startswith(WHEEL_PREFIX) and name != AS_SENT]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Source:
     """One source of error of p parameters, as one-sigma effects."""
 
     name: str
-    effects: Floats       # (p, k) of k independent unit errors; on ln K for a scale factor
+    effects: Floats       # (p, k) of k independent unit errors; relative for a scale factor
     shared: bool = False  # the same in every leg of a vehicle (heading source, lever arm)
 
 
@@ -128,7 +128,7 @@ class LegResult:
     origin: tuple[float, float, float] | None = None  # latitude, longitude rad, height m of n
     bag: str = ''                         # recording of the leg, empty when live
     C_bi: Floats | None = None            # (3, 3) nominal rotation used, imu frame to b
-    deciding: tuple[str, ...] = ()        # methods whose verdict counts, all if empty
+    deciding: tuple[str, ...] = ()        # names of the methods whose verdict counts, () all
     evidence: Evidence | None = None      # plot data, None if no track was usable
     path_ratio: float | None = None       # median ratio of distance between fixes to travel
     cut_from_ns: int | None = None        # start mark of the leg of which this is a section
@@ -193,8 +193,9 @@ def raise_on_overflow() -> np.errstate:
     return np.errstate(over='raise', divide='raise', invalid='raise')
 
 
-def failed(refuse: Callable[[Reason], MethodResult], name: str, error: Exception) -> MethodResult:
-    """Return the result of a method that raised; refuse: makes its result without values."""
+def failed_result(refuse: Callable[[Reason], MethodResult], name: str,
+                  error: Exception) -> MethodResult:
+    """Return the result of a method that raised; refuse: returns a result without values."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     text = ' '.join(str(error).split())[:200]
     reason = Reason(Code.METHOD_FAILED, f'method {name} failed with an internal error: '

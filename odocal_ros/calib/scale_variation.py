@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Scale of the fixes relative to dead reckoning, by section and by length of a window.
+Scale of the fixes relative to dead reckoning, in sections of the path and in windows of time.
 
-The scale of sections shows a change of the odometer scale during the drive. The scale is the same
-for windows of all lengths, unless fix errors depend on the motion over seconds: of a receiver that
-filters, dead-reckons or uses an odometer, and with late stamps.
+The scale in sections shows a change of the odometer scale during the drive. The scale in windows
+of all lengths is the same, unless fix errors depend on the motion over seconds: with a receiver
+that filters, dead-reckons or uses an odometer, and with late stamps.
 """
 
 from dataclasses import dataclass
@@ -56,8 +56,9 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
     Return the scale of each tenth of the path, relative to the one used in dead reckoning.
 
     The dead-reckoned section is rotated, scaled and shifted onto its fixes by least squares. The
-    sigma is by the residuals of all sections, as means of a few fixes, whose power and correlation
-    a first-order process matches. Errors that are constant in a section are not included.
+    sigma is from the residuals of all sections, as means of a few fixes, whose power and
+    correlation a first-order process matches. Errors that are constant in a section are not
+    included.
 
     path : (k,) path length at each fix, m, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and
     fixed positions, m.   sigma : (k,) stated for a fix, m per horizontal axis; a hundredth of its
@@ -65,7 +66,8 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
     """
     total = path[-1] - path[0] if len(path) else 0.0
     min_fixes = 8      # of a section, twice the parameters of its fit
-    count = int(min(10, len(path) // min_fixes, total // 10.0))      # tenths, of 10 m at least
+    # of sections: ten, each with min_fixes and 10 m at least
+    count = int(min(10, len(path) // min_fixes, total // 10.0))
     if count < 1:
         return Sections(*(np.empty(0) for _ in range(4)))
     edges = path[0] + total * np.linspace(0.0, 1.0, count + 1)
@@ -140,6 +142,14 @@ def _residual_properties(n: int) -> Floats:
     return np.array(table).T
 
 
+class CounterChange(NamedTuple):
+    """A possible change of the counter; the least scatter comes first."""
+
+    scatter: float    # of the scale on each side, over the change
+    section: int      # in which the scale changes
+    factor: float     # counts per metre after the change over those before
+
+
 def counter_change_reasons(scales: Sections, t_fix: Floats,
                            distance: Floats) -> tuple[Reason, ...]:
     """
@@ -150,7 +160,7 @@ def counter_change_reasons(scales: Sections, t_fix: Floats,
     """
     known = np.flatnonzero(np.isfinite(scales.ratio) & (scales.ratio > 0))
     log_scale, sigma = np.log(scales.ratio[known]), scales.sigma[known]
-    candidates = []      # (scatter over change, section of the change, factor)
+    candidates: list[CounterChange] = []
     for k in range(1, len(known) - 1):
         sides = [log_scale[:k], log_scale[k + 1:]]
         before, after = (np.median(side) for side in sides)
@@ -158,11 +168,12 @@ def counter_change_reasons(scales: Sections, t_fix: Floats,
         sigma_of_change = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
         if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * sigma_of_change,
                                      scatter / SIDE_SCATTER):
-            candidates.append((scatter / abs(after - before), k, float(np.exp(before - after))))
+            candidates.append(CounterChange(
+                scatter / abs(after - before), int(known[k]), float(np.exp(before - after))))
     if not candidates:
         return ()
-    _, k, factor = min(candidates)
-    begin, end = np.interp([scales.begin[known[k]], scales.end[known[k]]], distance, t_fix)
+    _, section, factor = min(candidates)
+    begin, end = np.interp([scales.begin[section], scales.end[section]], distance, t_fix)
     text = f'after t = {begin:.0f} to {end:.0f} s the odometer counts '
     if not 1 / MAX_DECODING < factor < MAX_DECODING:
         return (Reason(Code.TRACK_MISMATCH, text + f'{"far more" if factor > 1 else "far less"} '
@@ -175,34 +186,34 @@ def counter_change_reasons(scales: Sections, t_fix: Floats,
                    'Mark a leg before or after it with --leg.'),)
 
 
-def window_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats) -> Floats:
+def window_scale(t_fix: Floats, fix_n: Floats, reckoned_n: Floats) -> Floats:
     """
-    Return length of the windows, s, scale - 1 of the fixes, its sigma, and windows: (w, 4).
+    Return the scale for each of WINDOWS: (w, 4).
 
-    t_fix : (k,) times of fixes, s, rising.   fix_n, dead_n : (k, 2 or more) positions by fixes and
-    by dead reckoning, m. The sigma is by the scatter over parts of the leg (jackknife); it is too
-    small if errors last longer than such a part.
+    Columns: length of the windows, s, scale of the fixes minus 1, its sigma, number of windows.
+
+    t_fix : (k,) times of fixes, s, rising.   fix_n, reckoned_n : (k, 2 or more) positions by fixes
+    and by dead reckoning, m. The sigma is from the scatter over parts of the leg (jackknife); it
+    is too small if errors last longer than such a part.
     """
-    rows = [(length, *ratio) for length in WINDOWS
-            if (ratio := _window_ratio(t_fix, fix_n[:, :2], dead_n[:, :2], length))]
-    return np.array(rows) if rows else NO_WINDOWS
+    rows = [_window_row(t_fix, fix_n[:, :2], reckoned_n[:, :2], length) for length in WINDOWS]
+    return np.array([row for row in rows if row]) if any(rows) else NO_WINDOWS
 
 
-def _window_ratio(t: Floats, fix: Floats, dead: Floats,
-                  length: float) -> tuple[float, float, int] | None:
-    """Return scale - 1, its sigma and the number of windows of a length, half a length apart."""
+def _window_row(t: Floats, fix: Floats, reckoned: Floats, length: float) -> tuple[float, ...]:
+    """Return the row of ``window_scale`` for windows half a length apart, () if not determined."""
     begin = np.arange(t[0], t[-1] - length, length / 2) if len(t) else np.empty(0)
     # without the last fix: by rounding, the end of the last window may be after it
     first, last = np.searchsorted(t, begin), np.searchsorted(t[:-1], begin + length)
     # judgement: else some fixes are missing
     has_fixes = np.abs(t[last] - t[first] - length) < length / 4
     first, last = first[has_fixes], last[has_fixes]
-    chord = dead[last] - dead[first]
+    chord = reckoned[last] - reckoned[first]
     size = np.hypot(*chord.T)
     first, last, chord, size = (x[size > 0] for x in (first, last, chord, size))
     if len(first) < MIN_WINDOWS:
-        return None
-    # of the chord of the fixes along that of the dead reckoning, m
+        return ()
+    # length of the fixes' chord along the dead-reckoned one, minus the latter, m
     excess = (chord * (fix[last] - fix[first] - chord)).sum(axis=1) / size
     limit = 4 * max(robust_sigma(excess), 1e-9)       # statistical: one in 16,000
     excess = np.clip(excess, -limit, limit)
@@ -211,8 +222,8 @@ def _window_ratio(t: Floats, fix: Floats, dead: Floats,
     product, square = (np.bincount(part, x, LEG_PARTS) for x in (size * excess, size**2))
     # no part may have more than half of the weight
     if (square > 0).sum() < LEG_PARTS / 2 or square.max() > square.sum() / 2:
-        return None
+        return ()
     without_part = (product.sum() - product) / (square.sum() - square)
     scatter = ((without_part - without_part.mean())**2).sum()
     sigma = np.sqrt((LEG_PARTS - 1) / LEG_PARTS * scatter)
-    return float(product.sum() / square.sum()), float(sigma), len(first)
+    return length, float(product.sum() / square.sum()), float(sigma), len(first)

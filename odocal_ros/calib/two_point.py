@@ -73,7 +73,7 @@ def solve(inputs: TwoPointInput, up_scale: float = 1.0) -> tuple[Floats, Reason 
     if inputs.start.height_known and inputs.end.height_known:
         cause = 'are too inaccurate for the pitch'
         if up_scale * height_sigma < PITCH_PRIOR * horizontal:
-            f = _solved(inputs, True)
+            f = _solve_chord(inputs, with_heights=True)
             if abs(np.arctan2(f[2], np.hypot(f[0], f[1]))) <= PITCH_LIMIT:
                 return f, None
             _, pitch = mounting_from_forward(f / np.linalg.norm(f))
@@ -89,10 +89,11 @@ def solve(inputs: TwoPointInput, up_scale: float = 1.0) -> tuple[Floats, Reason 
 
 def solve_level(inputs: TwoPointInput) -> Floats:
     """Return f as ``solve``, with a pitch of zero and without the heights."""
-    return _solved(inputs, False)
+    return _solve_chord(inputs, with_heights=False)
 
 
-def _solved(inputs: TwoPointInput, with_heights: bool) -> Floats:
+def _solve_chord(inputs: TwoPointInput, with_heights: bool) -> Floats:
+    """Return f of M f = c; without heights, from the horizontal rows and with a pitch of zero."""
     M = inputs.M
     attitude_change = inputs.track.C_nb_at(inputs.end.t) - inputs.track.C_nb_at(inputs.start.t)
     antenna = inputs.end.position_n - inputs.start.position_n
@@ -112,8 +113,8 @@ def refusal_reasons(inputs: TwoPointInput, scale_guess: float) -> tuple[Reason, 
     path = np.abs(np.diff(inputs.track.s[inside])).sum() * scale_guess
     length = np.hypot(*(inputs.end.position_n - inputs.start.position_n)[:2])
     # |det M|^(1/2) is the chord length of the track per unit of scale, for any yaw
-    reckoned = np.sqrt(abs(np.linalg.det(inputs.M[:2, :2]))) * scale_guess
-    for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
+    reckoned_length = np.sqrt(abs(np.linalg.det(inputs.M[:2, :2]))) * scale_guess
+    for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned_length)):
         if chord_length <= MIN_CHORD_SHARE * path:
             return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
                            f'{chord_length:.1f} m, less than a fifth of the path length of about '
@@ -217,17 +218,17 @@ def _yaw_reasons(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
                  config: Config) -> tuple[tuple[Reason, ...], bool]:
     """Return the reasons about yaw (rad), from the heading, and True if it is separable."""
     limit = config.verdict.max_yaw_sigma
-    by_heading = next(s for s in sources if s.name == 'initial_heading')
-    heading_sigma = float(np.linalg.norm(by_heading.effects[1]))
+    heading_source = next(s for s in sources if s.name == 'initial_heading')
+    heading_sigma = float(np.linalg.norm(heading_source.effects[1]))
     reasons: tuple[Reason, ...] = ()
     if not alignment.heading_separable:
         reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'the only heading is the course over ground, '
                            'which includes the mounting angle: the end points only constrain the '
                            'sum of heading and yaw'),)
     elif heading_sigma > limit:
-        compared = with_limit(float(np.rad2deg(heading_sigma)), float(np.rad2deg(limit)), 'deg')
+        sigma_text = with_limit(float(np.rad2deg(heading_sigma)), float(np.rad2deg(limit)), 'deg')
         reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'heading uncertainty '
-                           f'({alignment.heading_source}) is {compared}: the end points only '
+                           f'({alignment.heading_source}) is {sigma_text}: the end points only '
                            'constrain the sum of heading and yaw'),)
     deviation = abs(float(wrap(yaw - nominal_yaw(config))))
     if alignment.heading_separable and deviation > BACKWARDS_YAW:

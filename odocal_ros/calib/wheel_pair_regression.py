@@ -77,7 +77,7 @@ def fit_right_path(pair: WheelPair, regressors: Floats, metres_per_unit: float,
     """
     Return coefficients, (k,), and their covariance; None with few cells or a ratio below 0.
 
-    regressors : (n, 6) as above, and others.
+    regressors : (n, k) those of ``right_path_regressors`` first.
     """
     edges = np.arange(0, len(pair.t), MEAN_STEPS)      # of cells of a second
     design, y = np.diff(regressors[edges], axis=0), np.diff(pair.right[edges])
@@ -120,10 +120,10 @@ def side_reasons(pair: WheelPair, width: float, sigma: float,
 class RatioChange(NamedTuple):
     """A change of the ratio of the wheels at a place of the path."""
 
-    sigmas: float
+    sigmas: float      # size of the change in sigmas
     change: float      # relative
-    share: float       # of the path before it
-    row: int
+    share: float       # of the path that is before the change
+    row: int           # of the pair, at the change
 
 
 def find_ratio_change(pair: WheelPair, regressors: Floats, metres_per_unit: float,

@@ -32,7 +32,7 @@ from odocal_ros.forecast.forecast import LegEnded
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.time_series import running_integral
-from odocal_ros.pipeline.calibrate import faults, screen_leg, Screened
+from odocal_ros.pipeline.calibrate import find_faults, screen_leg, ScreenedLeg
 from odocal_ros.reasons import Reason
 from odocal_ros.screening import imu_orientation
 from odocal_ros.screening.inputs import Inputs, locate_fixes, LocatedFixes
@@ -73,14 +73,14 @@ class ImuGaps:
 
 
 @lru_cache(maxsize=1)      # faults and running estimate of one update use the same leg
-def screened_in_cells(leg: Leg, config: Config) -> Screened:
+def screened_in_cells(leg: Leg, config: Config) -> ScreenedLeg:
     """Return the inputs of a leg whose IMU rows are means over cells of time."""
     return screen_leg(leg, _with_cells(leg, config))
 
 
 def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:
     """Return the faults of a leg whose IMU rows are means over cells of time."""
-    return faults(screened_in_cells(leg, config), _with_cells(leg, config))
+    return find_faults(screened_in_cells(leg, config), _with_cells(leg, config))
 
 
 def _with_cells(leg: Leg, config: Config) -> Config:

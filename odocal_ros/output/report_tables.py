@@ -28,7 +28,7 @@ DATA_CODES = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.
 def label(name: str, local: bool = False) -> str:
     """Return an estimate, method or error source in words; local : positions in a local frame."""
     if name in result.wheel_factors([name]):
-        return f'scale factor, {name.removeprefix(result.FACTOR)} wheel'
+        return f'scale factor, {name.removeprefix(result.WHEEL_PREFIX)} wheel'
     return tables.source_label(name, local)
 
 

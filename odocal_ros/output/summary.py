@@ -64,7 +64,8 @@ def values_in_words(estimates: dict[str, result.Estimate]) -> str:
     if scale.value is not None:
         counts = f' ({texts.inverse_text(scale)})' if scale.unit in texts.COUNTS else ''
         parts = [f'scale factor {texts.with_unit(scale)}{counts}']
-    labels = {name: name.removeprefix(result.FACTOR) for name in result.wheel_factors(estimates)}
+    labels = {name: name.removeprefix(result.WHEEL_PREFIX)
+              for name in result.wheel_factors(estimates)}
     for name, label in (labels | {'track_width': 'track width'}).items():
         wheel = texts.finite_estimate(estimates, name)
         if wheel.value is not None:
@@ -168,7 +169,7 @@ def _wheel_lines(estimates: dict[str, result.Estimate]) -> dict[str, str]:
     """Return factor -> line of the wheel, and position -> '', for more than two wheels."""
     lines: dict[str, str] = {}
     for name in result.wheel_factors(estimates):
-        wheel = name.removeprefix(result.FACTOR)
+        wheel = name.removeprefix(result.WHEEL_PREFIX)
         positions = {f'{axis}_position_{wheel}': sides for axis, sides in SIDE_TEXTS.items()}
         if any(position in estimates for position in positions):
             places = [f'{abs(place.value):.3f} m {sides[place.value < 0]}'

@@ -39,11 +39,11 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
                              relative['scale_factor']) | dict(relative)
     effects = np.array([[relative.get(parameter, 0.0)] for parameter in method.parameters])
     estimates = dict(method.estimates)
-    for parameter, of_value in relative.items():
+    for parameter, relative_sigma in relative.items():
         estimate = estimates.get(parameter)
         if estimate and estimate.value is not None and estimate.sigma is not None:
             estimates[parameter] = replace(estimate, sigma=float(np.hypot(
-                estimate.sigma, of_value * estimate.value)))
+                estimate.sigma, relative_sigma * estimate.value)))
     row = {parameter: relative.get(parameter, 0.0) * (method.estimates[parameter].value or 0.0)
            for parameter in method.parameters} | {'shared': shared}
     sigma_reasons = [reason for reason in check_limits(estimates, prepared.nominal_scale,
@@ -64,17 +64,18 @@ def with_wheel_change(method: MethodResult, prepared: PreparedLeg) -> MethodResu
     if not change:
         return method
     # the mean of ``count`` wheels changes by change / count: the error is half of it
-    of_mean, of_wheel = change / 2 / prepared.wheel_slips.count, change / 2
-    return with_scale_error(method, prepared, 'slow_wheel_slip', dict.fromkeys(SCALES, of_mean)
-                            | dict.fromkeys(wheel_factors(method.estimates), of_wheel))
+    mean_error, wheel_error = change / 2 / prepared.wheel_slips.count, change / 2
+    return with_scale_error(method, prepared, 'slow_wheel_slip', dict.fromkeys(SCALES, mean_error)
+                            | dict.fromkeys(wheel_factors(method.estimates), wheel_error))
 
 
 def with_hills(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
-    """Return a result; without an accelerometer with the error of hills and without pitch."""
+    """Return a result, without an accelerometer with the error of hills and without pitch."""
     if prepared.inputs.has_accelerometer:
         return method
-    hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a path longer
-    method = with_scale_error(method, prepared, 'hills', dict.fromkeys(SCALES, hills))
+    # relative: slopes of 3 % make the path longer by half their mean square
+    hills_error = 5e-4
+    method = with_scale_error(method, prepared, 'hills', dict.fromkeys(SCALES, hills_error))
     # reported by NO_ACCELEROMETER, with another remedy
     dropped_codes = {Code.PITCH_NOT_DETERMINED} | (
         set() if prepared.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
@@ -86,13 +87,12 @@ def with_hills(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
 
 
 def half_step(inputs: Inputs) -> float:
-    """Return half a step relative to the mean speed, the bias if truncated; 0.0 without steps."""
+    """Return half a step over the mean speed, the bias of truncated speeds; 0.0 without steps."""
     coarse = _coarse_speed(inputs)
     if coarse is None:
         return 0.0
-    pick = (coarse.t >= 0.0) & (coarse.t <= inputs.t_stop) & (coarse.value != 0)
-    mean = float(np.abs(coarse.value[pick]).mean()) if pick.any() else 0.0
-    return coarse.truncation / mean if mean else 0.0
+    moves = (coarse.t >= 0.0) & (coarse.t <= inputs.t_stop) & (coarse.value != 0)
+    return coarse.truncation / float(np.abs(coarse.value[moves]).mean()) if moves.any() else 0.0
 
 
 def with_truncation(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
@@ -106,15 +106,15 @@ def with_truncation(method: MethodResult, prepared: PreparedLeg) -> MethodResult
 
 def coarse_reasons(inputs: Inputs, located: LocatedFixes) -> list[Reason]:
     """Return the reasons for coarse steps of speed or counts."""
-    K, size = located.nominal_scale or located.rough_scale, half_step(inputs)
-    count = inputs.travel.quantum * K
+    relative_half_step = half_step(inputs)
+    count_m = inputs.travel.quantum * (located.nominal_scale or located.rough_scale)
     coarse_count_m = 0.2    # m, least size of a coarse count
-    if count > coarse_count_m:
-        return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m, so each reading lags '
-                       'by up to this distance')]
+    if count_m > coarse_count_m:
+        return [Reason(Code.COUNTER_COARSE, f'one count is {count_m:.2f} m, so each counter value '
+                       'lags by up to this distance')]
     coarse = _coarse_speed(inputs)
-    coarse_worth = 5e-4    # of the scale: least half step that is reported
-    if coarse is None or coarse.truncation and size < coarse_worth:
+    reported_from = 5e-4    # relative: least half step that is reported
+    if coarse is None or coarse.truncation and relative_half_step < reported_from:
         return []
     step = _speed_text(coarse.step, located.rough_scale, inputs.scale_unit)
     if not coarse.truncation:
@@ -122,7 +122,7 @@ def coarse_reasons(inputs: Inputs, located: LocatedFixes) -> list[Reason]:
                        f'{step}; half a step is added in the direction of the last change')]
     between = ', with interpolated values between' if coarse.interpolated else ''
     return [Reason(Code.SPEED_COARSE, f'odometer resolution is {step}{between}; if truncated, '
-                   f'the distance is {100 * size:.2g} % too short')]
+                   f'the distance is {100 * relative_half_step:.2g} % too short')]
 
 
 def _speed_text(step: float, scale: float, scale_unit: str) -> str:
@@ -134,8 +134,9 @@ def _speed_text(step: float, scale: float, scale_unit: str) -> str:
 
 
 def _coarse_speed(inputs: Inputs) -> CoarseSpeed | None:
-    """Return the coarse speed of the first wheel that has one, None if there is none."""
-    return next((one.coarse for one in (inputs.travel, *inputs.travels) if one.coarse), None)
+    """Return the coarse speed of the first travel that has one, None if there is none."""
+    return next((travel.coarse for travel in (inputs.travel, *inputs.travels) if travel.coarse),
+                None)
 
 
 def delay_notes(prepared: PreparedLeg, delays: Mapping[str, tuple[float, float]],
@@ -150,14 +151,14 @@ def delay_notes(prepared: PreparedLeg, delays: Mapping[str, tuple[float, float]]
         metres = abs(delay) * speed
         if name in prepared.inputs.clock_delays or not (
                 abs(delay) > REMARK_SIGMAS * sigma and metres > observable_m):
-            continue        # of an aligned clock the delay is reported already: this is the rest
-        set_to = getattr(prepared.config, name).time_offset
+            continue        # the delay of an aligned clock is reported already: this is the rest
+        time_offset = getattr(prepared.config, name).time_offset
         notes.append(Reason(
             Code.DELAY_SEEN, f'{SENSOR_LABEL[name]} stamps are {abs(delay):.3f} s '
             f'(± {sigma:.3f} s) {"late" if delay > 0 else "early"} relative to the other sensors, '
             f'{metres:.2g} m at {speed:.1f} m/s; accounted for. To remove the delay, set '
-            f'{name}.time_offset to {set_to - delay:.3f}'
-            + (f' (now {set_to:g})' if set_to else '')))
+            f'{name}.time_offset to {time_offset - delay:.3f}'
+            + (f' (now {time_offset:g})' if time_offset else '')))
     return notes
 
 

@@ -37,18 +37,19 @@ from odocal_ros.screening.reversing import BY_FIT, reversing_reasons, sections_s
 from odocal_ros.screening.screen import screen_aligned
 from odocal_ros.settings.config import Config
 
-__all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'screen_leg', 'Screened']
+__all__ = ['calibrate', 'calibrate_parts', 'combine', 'find_faults', 'screen_leg',
+           'ScreenedLeg']
 # reasons that disappear with more driving
 PROVISIONAL_CODES = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
 
 
-class Screened(NamedTuple):
-    """A leg with its clocks aligned, its inputs, reasons, and True if it can be calibrated."""
+class ScreenedLeg(NamedTuple):
+    """A leg after the screening of its data."""
 
-    leg: Leg
-    inputs: Inputs
+    leg: Leg          # with its clocks aligned
+    inputs: Inputs    # its usable rows
     reasons: tuple[Reason, ...]
-    usable: bool
+    usable: bool      # True: it can be calibrated
 
 
 def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
@@ -86,7 +87,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     return result_of(inputs.mirrored(reversed_spans), reasons)
 
 
-def faults(screened: Screened, config: Config) -> tuple[Reason, ...]:
+def find_faults(screened: ScreenedLeg, config: Config) -> tuple[Reason, ...]:
     """Return the faults of a leg's data, without reasons that disappear with more driving."""
     reasons = screened.reasons
     if screened.usable:
@@ -96,7 +97,7 @@ def faults(screened: Screened, config: Config) -> tuple[Reason, ...]:
                  if r.code.severity is not Verdict.ACCEPTED and r.code not in PROVISIONAL_CODES)
 
 
-def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
+def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> ScreenedLeg:
     """Return a leg with its usable inputs, z of b up, and the reasons of the screening."""
     config = settings_by_frame(leg.fix, config)
     leg, inputs, screening_reasons = screen_aligned(leg, config)
@@ -104,11 +105,11 @@ def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screen
     missing = missing_data_reasons(leg, inputs)
     if missing or not len(inputs.t_fix):
         known = {r.code for r in reasons}
-        return Screened(leg, inputs, (*reasons, *(r for r in missing if r.code not in known)),
+        return ScreenedLeg(leg, inputs, (*reasons, *(r for r in missing if r.code not in known)),
                         False)
     imu_reasons, z_down = unit_and_axis_reasons(inputs.median_f_b, inputs.w_b, inputs.C_bi,
                                                 config.imu)
-    # takes precedence: the mean gravity of the other test is then meaningless
+    # a turn of gravity takes precedence: the mean gravity of the other test is then meaningless
     if gravity_turns := gravity_turn_reasons(inputs):
         imu_reasons, z_down = gravity_turns, False
     imu_reasons = imu_reasons or unit_change_reasons(inputs)
@@ -117,7 +118,7 @@ def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screen
     if z_down:      # forward-right-down: rotated to forward-left-up
         C = matrix_from_rpy([np.pi, 0.0, 0.0])
         inputs = replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
-    return Screened(leg, inputs, reasons, not UNUSABLE & {r.code for r in imu_reasons})
+    return ScreenedLeg(leg, inputs, reasons, not UNUSABLE & {r.code for r in imu_reasons})
 
 
 def _reversed_sections(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
@@ -147,15 +148,15 @@ def missing_data_reasons(leg: Leg, inputs: Inputs) -> list[Reason]:
 
 
 def parts_between(leg: Leg, gaps: Ints) -> list[Leg]:
-    """Return the parts of a leg between gaps, (k, 2) ns; the leg itself if none or many."""
+    """Return the parts of a leg between gaps, (k, 2) ns; none if there are no or too many gaps."""
     max_parts = 20    # with more gaps the leg is rejected
     if not 0 < len(gaps) < max_parts:
-        return [leg]
-    begins = [None, *gaps[:, 1].tolist()]
-    spans = [(max(first or leg.start_ns, leg.start_ns), last, first)
-             for first, last in zip(begins, [*gaps[:, 0].tolist(), leg.stop_ns], strict=True)]
+        return []
+    gap_ends, part_ends = [None, *gaps[:, 1].tolist()], [*gaps[:, 0].tolist(), leg.stop_ns]
+    spans = [(max(gap_end or leg.start_ns, leg.start_ns), part_end, gap_end)
+             for gap_end, part_end in zip(gap_ends, part_ends, strict=True)]
     shortest_ns = 10**9    # of a part: shorter ones are dropped
-    return [part_of(leg, *span) for span in spans if span[1] - span[0] >= shortest_ns] or [leg]
+    return [part_of(leg, *span) for span in spans if span[1] - span[0] >= shortest_ns]
 
 
 def imu_gaps(leg: Leg, limit_s: float) -> Ints:
@@ -192,7 +193,7 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
     """Return the results of a leg's parts that can be calibrated, otherwise that of the leg."""
     def usable_results(parts: list[Leg]) -> list[LegResult]:
         results = []
-        for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
+        for k, part in enumerate(parts):
             def report(stage: Stage, k: int = k) -> None:
                 if progress is not None:
                     progress(replace(stage, done=(k + stage.done) / len(parts)))

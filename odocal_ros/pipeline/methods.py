@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The methods, each a pure function of a prepared leg, and the result of the leg from theirs."""
+"""The methods, each a pure function of a prepared leg, and the leg's result from theirs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -12,7 +12,13 @@ import numpy as np
 
 from odocal_ros.calib import choice
 from odocal_ros.calib.drive import path_and_chord
-from odocal_ros.calib.result import AS_SENT, failed, LegResult, MethodResult, raise_on_overflow
+from odocal_ros.calib.result import (
+    AS_SENT,
+    failed_result,
+    LegResult,
+    MethodResult,
+    raise_on_overflow,
+)
 from odocal_ros.calib.two_point import refused_result
 from odocal_ros.data.arrays import release_mapped_memory
 from odocal_ros.data.leg import Leg
@@ -76,16 +82,16 @@ def reasons_on_data(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[R
     """
     reasons: list[Reason] = []
     delay_reasons: list[Reason] = []
-    odometer: tuple[Reason, ...] | None = None
+    odometer_reasons: tuple[Reason, ...] | None = None
     for run in (runs[name] for name in METHODS if name in runs):
         reasons += run.data_reasons
         scale = run.result.estimates['scale_factor'].value
         if run.delays is not None and scale is not None:
             delay_reasons = beyond_model.delay_notes(prepared, run.delays, scale)
-        is_usable = odometer is None or run.result.verdict is not Verdict.REJECTED
+        is_usable = odometer_reasons is None or run.result.verdict is not Verdict.REJECTED
         if run.odometer_reasons is not None and is_usable:
-            odometer = run.odometer_reasons
-    return [*reasons, *(odometer or ()), *delay_reasons]
+            odometer_reasons = run.odometer_reasons
+    return [*reasons, *(odometer_reasons or ()), *delay_reasons]
 
 
 def _add_model_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
@@ -114,7 +120,7 @@ def _run_guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]
             Code.NOT_CONVERGED, f'{name} did not converge: an estimate became infinite or '
             'NaN. Likely cause: invalid or missing samples')))
     except Exception as error:      # its reasons may be wrong too and are dropped
-        return MethodRun(failed(lambda reason: REFUSED_RESULTS[name](inputs, reason), name, error))
+        return MethodRun(failed_result(partial(REFUSED_RESULTS[name], inputs), name, error))
 
 
 def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
@@ -163,8 +169,9 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
                 methods[name] = replace(run.result, details=run.result.details | check)
                 reasons += track_reasons
     # outlier fixes are reported once, by the first method or track
-    on_outliers = [k for k, reason in enumerate(reasons) if reason.code is Code.BAD_ROWS_DROPPED]
-    reasons = [reason for k, reason in enumerate(reasons) if k not in on_outliers[1:]]
+    outlier_reasons = [k for k, reason in enumerate(reasons)
+                       if reason.code is Code.BAD_ROWS_DROPPED]
+    reasons = [reason for k, reason in enumerate(reasons) if k not in outlier_reasons[1:]]
     return leg_result(leg, inputs, (*prepared.reasons, *reasons), methods,
                       deciding=choice.deciding_methods(selected_method),
                       distance=prepared.distance, path_ratio=prepared.path_ratio, **track_fields)

@@ -5,14 +5,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from odocal_ros.calib.choice import PLANAR
 from odocal_ros.calib.planar import run as planar
 from odocal_ros.calib.planar.result import make_planar_result, refused_planar_result
-from odocal_ros.calib.result import failed, LegResult, MethodResult, raise_on_overflow
+from odocal_ros.calib.result import failed_result, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
@@ -32,15 +32,15 @@ MIN_POSITIONS = 10       # judgement: as for other methods
 SLOPE_LENGTH, HEIGHT_SIGMAS = 5.0, 30.0
 # rad/sqrt(s), judgement: effect of tilt and vibration of a robot, not included in the grade
 MIN_GYRO_NOISE = 1e-3
-BY_AXLE = 'left before right of each axle from front to rear.'
+AXLE_ORDER = 'left before right of each axle from front to rear.'
 # reasons about the IMU, which the planar estimator does not need
 IMU_CODES = {Code.NO_IMU, Code.NO_ACCELEROMETER, Code.IMU_GAP, Code.LOCAL_FRAME}
 
 
 def is_planar(leg: Leg, config: settings.Config) -> bool:
     """Return True for a leg of the planar estimator: several wheels and no IMU, or its drives."""
-    several = len(leg.wheel_slots) > 1
-    return config.odometer.drive != settings.DIFFERENTIAL or several and not len(leg.imu.stamp_ns)
+    has_no_imu = len(leg.wheel_slots) > 1 and not len(leg.imu.stamp_ns)
+    return config.odometer.drive != settings.DIFFERENTIAL or has_no_imu
 
 
 def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
@@ -80,7 +80,7 @@ def _fit_guarded(run: planar.Run, inputs: Inputs, config: settings.Config,
     except (OdocalError, MemoryError):
         raise
     except Exception as error:
-        return failed(unknown, PLANAR, error), {}
+        return failed_result(unknown, PLANAR, error), {}
 
 
 def _make_run(inputs: Inputs, config: settings.Config) -> tuple[planar.Run | None, list[Reason]]:
@@ -94,30 +94,30 @@ def _make_run(inputs: Inputs, config: settings.Config) -> tuple[planar.Run | Non
     if len(inside) < MIN_POSITIONS:
         return None, [Reason(Code.NO_FIX, f'{len(inside)} positions while the wheels have data; '
                              f'required: {MIN_POSITIONS}')]
-    t, node, used = _nodes(inputs.t_fix[inside])
-    used = inside[used]
-    place = np.nan_to_num(inputs.geodetic)
-    position = median_origin(inputs.t_fix, inputs.geodetic).to_n(place[used])[:, :2]
-    covariance = inputs.covariance_n[used]
+    nodes = _make_nodes(inputs.t_fix[inside])
+    t, rows = nodes.t, inside[nodes.rows]
+    geodetic = np.nan_to_num(inputs.geodetic[rows])
+    position = median_origin(inputs.t_fix, inputs.geodetic).to_n(geodetic)[:, :2]
+    covariance = inputs.covariance_n[rows]
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     steps = np.array([np.diff(travel.at(t)) for travel in travels])
     if kind in settings.HOLONOMIC:
-        rows = planar.wheel_rows(kind, len(steps), config.odometer.wheel_offset)
-        wheels = planar.Wheels(steps.T, rows, kind)
+        wheels = planar.Wheels(steps.T, planar.wheel_rows(
+            kind, len(steps), config.odometer.wheel_offset), kind)
     else:
         wheels = planar.make_side_wheels(steps[::2].mean(axis=0), steps[1::2].mean(axis=0), kind)
     if not wheels.count.any():
         return None, [Reason(Code.ODOMETER_STILL, 'the wheels do not turn during the leg')]
-    return planar.Run(t, wheels, node, position, sigma, _gyro_turns(inputs, t)), []
+    return planar.Run(t, wheels, nodes.with_position, position, sigma, _gyro_turns(inputs, t)), []
 
 
 def _wheel_count_reason(kind: str, count: int) -> Reason | None:
     """Return the reason if the number of wheels with known sides does not fit the drive."""
     needed, fits, order = {
-        settings.MECANUM: ('4', count == len(planar.MECANUM_ROWS), BY_AXLE),
+        settings.MECANUM: ('4', count == len(planar.MECANUM_ROWS), AXLE_ORDER),
         settings.OMNI: (f'{settings.MIN_OMNI_WHEELS} or more', count >= settings.MIN_OMNI_WHEELS,
                         'counter-clockwise, the first at odometer.wheel_offset.')}.get(
-        kind, ('2', count >= 2 and count % 2 == 0, BY_AXLE))
+        kind, ('2', count >= 2 and count % 2 == 0, AXLE_ORDER))
     return None if fits else Reason(
         Code.NO_ODOMETER, f'{kind} drive: {max(count, 1)} wheels with known sides; required: '
         f'{needed}', f'Name the wheels in odometer.wheels, {order}')
@@ -129,29 +129,37 @@ def shortened_by_slopes(inputs: Inputs) -> float:
     if has_height.sum() < MIN_POSITIONS:
         return 0.0
     geodetic = inputs.geodetic[has_height]
-    place = median_origin(inputs.t_fix[has_height], geodetic).to_n(geodetic)
+    position = median_origin(inputs.t_fix[has_height], geodetic).to_n(geodetic)
     variance = np.median(np.einsum('kii->ki', inputs.covariance_n[has_height]), axis=0)
-    path = running_sum(np.hypot(*np.diff(place[:, :2], axis=0).T))
+    path = running_sum(np.hypot(*np.diff(position[:, :2], axis=0).T))
     length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance[2])))
     ends = np.searchsorted(path[:-1], np.arange(0.0, path[-1], length))
-    run = np.hypot(*np.diff(place[ends, :2], axis=0).T)
-    straight = run > length / 2      # judgement: otherwise it turned back, or is noise
-    slope = np.diff(place[ends, 2])[straight] / run[straight]
-    noise = 2 * variance[2] / np.maximum(run[straight], 1e-9)**2
+    chord = np.hypot(*np.diff(position[ends, :2], axis=0).T)
+    straight = chord > length / 2      # judgement: otherwise it turned back, or is noise
+    slope = np.diff(position[ends, 2])[straight] / chord[straight]
+    noise = 2 * variance[2] / np.maximum(chord[straight], 1e-9)**2
     return float(max(np.mean(slope**2 - noise), 0.0) / 2) if straight.any() else 0.0
 
 
-def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
-    """Return times of nodes, nodes with a position, and rows of positions, one per 0.1 s."""
+class Nodes(NamedTuple):
+    """Times at which the planar fit estimates poses."""
+
+    t: Floats              # (n,) s
+    with_position: Ints    # (k,) nodes with a position
+    rows: Ints             # (k,) their rows in the positions: one in each node interval
+
+
+def _make_nodes(t_fix: Floats) -> Nodes:
+    """Return nodes at positions, times (n,) s, and evenly between two that are far apart."""
     interval = max(NODE_INTERVAL, float(t_fix[-1] - t_fix[0]) / MAX_NODES)
     number = np.floor((t_fix - t_fix[0]) / interval + 1e-6)
-    used = np.flatnonzero(np.diff(number, prepend=-1.0) > 0)
-    kept = t_fix[used]
+    rows = np.flatnonzero(np.diff(number, prepend=-1.0) > 0)
+    kept = t_fix[rows]
     parts = np.maximum(np.ceil(np.diff(kept) / (1.5 * interval)), 1).astype(np.int64)
     node = running_sum(parts)
     share = (np.arange(parts.sum()) - np.repeat(node[:-1], parts)) / np.repeat(parts, parts)
     t = np.append(np.repeat(kept[:-1], parts) + share * np.repeat(np.diff(kept), parts), kept[-1])
-    return t, node, used
+    return Nodes(t, node, rows)
 
 
 def _gyro_turns(inputs: Inputs, t: Floats) -> Floats:

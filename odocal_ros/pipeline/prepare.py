@@ -54,9 +54,9 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
         inputs, located, orientation, config.imu.gyro_scale)[1]
     if axis_faults:             # a mirrored axis turns the orientation around
         return None, (*reasons, *axis_faults)
-    axes = imu_orientation.orientation_reasons(orientation, config.imu.nominal_yaw)
-    reasons = (*reasons, *with_mounting_remedy(axes, inputs))
-    if Code.IMU_AXES in {r.code for r in axes}:
+    axis_reasons = imu_orientation.orientation_reasons(orientation, config.imu.nominal_yaw)
+    reasons = (*reasons, *with_mounting_remedy(axis_reasons, inputs))
+    if Code.IMU_AXES in {r.code for r in axis_reasons}:
         return None, reasons
     prepared = _dead_reckoned(leg, inputs, config, located, orientation, reasons, alignment,
                               holdout)
@@ -125,16 +125,17 @@ def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reaso
 def _compare_wheels(inputs: Inputs, config: Config, located: LocatedFixes, track: Track,
                     reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
     """Return the faults found by comparing left and right wheels, and the slips of one of them."""
-    fixed = [axle for axle in pair_wheels(inputs.travels)
-             if len(axle) > 1 and not axle[0].distance_ahead]
-    if not fixed or not inputs.has_accelerometer or WHEEL_FAULT_CODES & {r.code for r in reasons}:
+    fixed_axles = [axle for axle in pair_wheels(inputs.travels)
+                   if len(axle) > 1 and not axle[0].distance_ahead]
+    has_fault = bool(WHEEL_FAULT_CODES & {r.code for r in reasons})
+    if not fixed_axles or not inputs.has_accelerometer or has_fault:
         return (), NO_SLIPS
     from odocal_ros.calib.wheel_faults import wheel_faults
     odometer, count = config.odometer, sum(not wheel.distance_ahead for wheel in inputs.travels)
     axle_reasons, wheel_slips = zip(*(wheel_faults(
         axle, inputs.imu, inputs.t_stop, track, located.origin.latitude,
         located.rough_scale, odometer.track_width, inputs.uncertain_t,
-        odometer.max_scale_deviation, count) for axle in fixed), strict=True)
+        odometer.max_scale_deviation, count) for axle in fixed_axles), strict=True)
     return tuple(chain(*axle_reasons)), join_axles(wheel_slips, count)
 
 

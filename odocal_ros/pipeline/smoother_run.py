@@ -100,12 +100,12 @@ def _delayed_path(track: Track, f: Floats, lever_b: Floats, delay: float) -> Pat
         t = t - delay
         inside = np.clip(t, track.t[0], track.t[-1])
         outside = np.clip(t - inside, -abs(delay), abs(delay))
-        P = track.P_at(inside)
-        onward = 0.2    # s of extrapolation beyond the data, for the delay
-        before = track.P_at(inside - np.copysign(onward, outside))
-        P = P + (P - before) * (np.abs(outside) / onward)[..., None, None]
+        summed = track.P_at(inside)      # attitude summed over travel
+        span = 0.2    # s at an end of the track, whose mean motion is continued for the delay
+        before = track.P_at(inside - np.copysign(span, outside))
+        summed = summed + (summed - before) * (np.abs(outside) / span)[..., None, None]
         release_mapped_memory()        # releases the sums before the attitudes are read
-        position: Floats = P @ f + track.C_nb_at(inside) @ lever_b
+        position: Floats = summed @ f + track.C_nb_at(inside) @ lever_b
         release_mapped_memory()
         return position
     return path
@@ -126,9 +126,9 @@ def planar_input(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
     if len(inputs.travels) != 2:
         return None
     left, right = inputs.travels
-    begin, end = (pick([float(x.t[at]) for x in (prepared.track, left, right)])
-                  for pick, at in ((max, 0), (min, -1)))
-    begin, end = max(0.0, begin), min(prepared.t_fit, end)
+    times = [part.t for part in (prepared.track, left, right)]
+    begin = max(0.0, *(float(t[0]) for t in times))
+    end = min(prepared.t_fit, *(float(t[-1]) for t in times))
     rough_path = prepared.path(np.array([prepared.rough_scale, 0.0, 0.0]))
     start = prepared.mark(begin, rough_path, 'start')
     if start is None or end <= begin:

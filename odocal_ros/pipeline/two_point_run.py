@@ -45,8 +45,8 @@ class TwoPointRun:
     """
     One run of the method on a leg; collects its reasons.
 
-    f : (3,) scale factor times the forward axis in b.   factor : (3,) on the stated sigmas of the
-    fixes.   reasons : on the method.   data_reasons : on the inputs.
+    f : (3,) scale factor times the forward axis in b.   factor : (3,) factors on the stated sigmas
+    of the fixes.   reasons : on the method.   data_reasons : on the inputs.
     """
 
     def __init__(self, prepared: PreparedLeg) -> None:
@@ -67,9 +67,9 @@ class TwoPointRun:
         f = solve_level(two_point)
         t_fix = self.inputs.t_fix
         between = (t_fix >= two_point.start.t) & (t_fix <= two_point.end.t)
-        inside, outlier_reasons = without_outliers(self.prepared, self.prepared.path(f),
-                                                   two_point.start, between)
-        between &= inside
+        is_inlier, outlier_reasons = without_outliers(self.prepared, self.prepared.path(f),
+                                                      two_point.start, between)
+        between &= is_inlier
         self.data_reasons += outlier_reasons
         factor = np.ones(3)
         if between.sum() >= 3:
@@ -95,10 +95,10 @@ class TwoPointRun:
         forward = corrected_forward_axis(self.prepared.imu_orientation, f)
         slips = slip_check(self.prepared, self.track, forward, ends)
         self.slip_reasons = slip_reasons(slips, self.config.odometer.time_offset)
-        of_wheel = self.prepared.wheel_slips      # of single wheels: 1 / count in the mean
-        inside = (of_wheel.t >= ends[0]) & (of_wheel.t <= ends[1])
-        return (np.append(slips.t, of_wheel.t[inside]),
-                np.append(slips.size, of_wheel.size[inside] / of_wheel.count))
+        wheel_slips = self.prepared.wheel_slips      # of single wheels: 1 / count in the mean
+        inside = (wheel_slips.t >= ends[0]) & (wheel_slips.t <= ends[1])
+        return (np.append(slips.t, wheel_slips.t[inside]),
+                np.append(slips.size, wheel_slips.size[inside] / wheel_slips.count))
 
     def _input(self) -> TwoPointInput | None:
         """Return track and marks; None, with a reason, without fixes."""
@@ -177,12 +177,12 @@ class TwoPointRun:
     def _check_track(self, two_point: TwoPointInput, f: Floats, fixes: tuple[Floats, Floats],
                      residual: Floats, drift: float) -> None:
         """Collect the reasons against the track: reversing, distance from the fixes, bend."""
-        prepared, (t, p) = self.prepared, fixes
+        prepared, (t, position_n) = self.prepared, fixes
         # track errors count as noise
         keep, _ = track_check.find_inliers(residual, prepared.fix_sigma)
-        sigma = max(prepared.fix_sigma, fix_white_noise(p[keep]))
+        sigma = max(prepared.fix_sigma, fix_white_noise(position_n[keep]))
         sections = reversals.cut_sections(
-            prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma)
+            prepared.level_path(t[keep]), position_n[keep, :2], t[keep], sigma)
         reversed_reasons = reversals.reversal_reasons(sections, self.config.odometer.signed)
         self.data_reasons += reversed_reasons
         if not reversed_reasons:

@@ -58,22 +58,24 @@ class Equations(NamedTuple):
 
 def normal_equations(rows: Rows, nodes: int) -> Equations:
     """Return the equations of the rows of one noise level, as if it were 1."""
-    A, B, C, w, k = rows.by_state, rows.by_next, rows.by_constants, rows.weight, rows.node
-    s, m = A.shape[2], C.shape[2]
+    by_state, by_next, by_constants, k = rows.by_state, rows.by_next, rows.by_constants, rows.node
+    s, m = by_state.shape[2], by_constants.shape[2]
 
     def product(X: Floats, Y: Floats) -> Floats:
-        return np.swapaxes(X * w[:, :, None], 1, 2) @ Y
+        """Return X' W Y of each group, with the weights W of the rows."""
+        return np.swapaxes(X * rows.weight[:, :, None], 1, 2) @ Y
     r = rows.value[:, :, None]
     # ``by_next`` of the last node is zero; it goes to an extra node that is removed below
     diagonal, off_diagonal = np.zeros((2, nodes + 1, s, s))
     cross, gradient = np.zeros((nodes + 1, s, m)), np.zeros((nodes + 1, s))
-    for node, X in ((k, A), (k + 1, B)):
-        diagonal[node] += product(X, X)
-        cross[node] += product(X, C)
-        gradient[node] += product(X, r)[:, :, 0]
-    off_diagonal[k] += product(A, B)
+    for node, derivatives in ((k, by_state), (k + 1, by_next)):
+        diagonal[node] += product(derivatives, derivatives)
+        cross[node] += product(derivatives, by_constants)
+        gradient[node] += product(derivatives, r)[:, :, 0]
+    off_diagonal[k] += product(by_state, by_next)
     return Equations(diagonal[:nodes], off_diagonal[:nodes], cross[:nodes], gradient[:nodes],
-                     product(C, C).sum(0), product(C, r).sum((0, 2)))
+                     product(by_constants, by_constants).sum(0),
+                     product(by_constants, r).sum((0, 2)))
 
 
 def weighted_sum(equations: Iterable[Equations], weight: Floats) -> Equations:

@@ -82,7 +82,7 @@ def first_values(run: Run, width: float) -> FirstValues:
 
 
 def _scale_guess(position: Complexes, path: Floats) -> float:
-    """Return metres per unit of wheel path: 75th percentile of lines between positions over it."""
+    """Return metres per unit of wheel path: 75th percentile of chord over wheel path."""
     step = max(float(path[-1] - path[0]) / 200, 1e-12)
     ends = np.unique(np.searchsorted(path[:-1], np.arange(path[0], path[-1], step)))
     ratio = np.abs(np.diff(position[ends])) / np.diff(path[ends])
@@ -92,8 +92,9 @@ def _scale_guess(position: Complexes, path: Floats) -> float:
 def _windows(path: Floats) -> Ints:
     """Return first and last + 1 position of each window, by the wheel path there, m: (w, 2)."""
     steps = np.sort(np.diff(path))
-    usual = steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)]    # median by path
-    length = max(WINDOW, WINDOW_STEPS * usual)
+    # median step, weighted by its length
+    median_step = steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)]
+    length = max(WINDOW, WINDOW_STEPS * median_step)
     begins = np.arange(path[0], max(path[-1] - length / 2, path[0] + 1e-9), length / 2)
     spans = np.stack([np.searchsorted(path, begins), np.searchsorted(path, begins + length)], -1)
     min_positions = 3

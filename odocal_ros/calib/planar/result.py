@@ -17,8 +17,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, SIDES
 
-# largest relative sigmas of a value. Judgement, by measurement on 24 simulated runs:
-# the two without a straight after their only turn have widths that are 3 to 570 sigma off, with a
+# largest relative sigmas of a stated value. Judgement, by measurement on 24 simulated runs: in the
+# two without a straight after their only turn, widths are wrong by 3 to 570 sigma, with a
 # sigma of 6 to 70 % of the width, or of 2.5 % of the scale
 SCALE_SIGMA_LIMIT, SIGMA_LIMIT = 0.02, 0.03
 ARC = 0.75      # definition: ``Wheels.straightness`` on a radius of twice the track width
@@ -84,7 +84,7 @@ def _select_quantities(constants: tuple[str, ...], config: Config) -> dict[str, 
 
 
 class Value(NamedTuple):
-    """A quantity with its errors."""
+    """The value of a quantity with its errors, in the unit of the value."""
 
     value: float
     effects: Floats      # (m,) of independent unit errors of the constants
@@ -107,8 +107,8 @@ def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
     values = _compute_values(fit, quantities, slopes)
     estimates, reasons = unknown_values(unit), _fit_reasons(fit)
     for name, quantity in quantities.items():
-        value, sigma, value_unit = values[name].value, values[name].sigma, (
-            unit if 'scale' in name else 'm')
+        value, sigma = values[name].value, values[name].sigma
+        value_unit = unit if 'scale' in name else 'm'
         if value > 0 and sigma < quantity.max_sigma * value:
             estimates[name] = Estimate(value, sigma, value_unit)
         else:
@@ -132,7 +132,7 @@ def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
 
 
 def _compute_values(fit: Fit, quantities: dict[str, Quantity], slopes: float) -> dict[str, Value]:
-    """Return the quantities of a fit by name."""
+    """Return the value of each quantity of a fit by name; slopes: as ``make_planar_result``."""
     constants = dict(zip(fit.names, fit.value.tolist(), strict=True))
     # a fit that has not converged has twice the sigma
     root = np.linalg.cholesky(fit.covariance) * (1.0 if fit.converged else 2.0)
@@ -180,7 +180,7 @@ def _fit_reasons(fit: Fit) -> list[Reason]:
     if fit.levels[noisy] > NOISE_LIMIT:
         reasons.append(Reason(
             Code.NOT_CONVERGED, f'wheels and positions differ by {1e3 * fit.levels[noisy]:.0f} mm '
-            f'per metre ({noisy}); the limit is {1e3 * NOISE_LIMIT:.0f} mm',
+            f'in a metre of travel ({noisy}); the limit is {1e3 * NOISE_LIMIT:.0f} mm',
             'Check the order of odometer.wheels, odometer.drive, odometer.time_offset and '
             'gnss.time_offset.'))
     return reasons

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.result import Estimate, FACTOR, MethodResult
+from odocal_ros.calib.result import Estimate, MethodResult, WHEEL_PREFIX
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import pair_wheels
 from odocal_ros.settings import levels
@@ -44,7 +44,7 @@ def wheel_details(wheels: Mapping[str, Wheel]) -> dict[str, Any]:
 
 def unknown_wheels(names: Sequence[str], scale_unit: str) -> dict[str, Estimate]:
     """Return the estimates of wheels without values, {} for one counter."""
-    return {FACTOR + name: Estimate(None, None, scale_unit) for name in names} | {
+    return {WHEEL_PREFIX + name: Estimate(None, None, scale_unit) for name in names} | {
         width: Estimate(None, None, 'm') for width in _widths(names)}
 
 
@@ -70,7 +70,7 @@ def wheel_estimates(names: Sequence[str], wheels: Mapping[str, Wheel], scale: Es
     for name, wheel in wheels.items():
         value = scale.value * wheel.ratio
         relative = np.hypot(scale.sigma / scale.value, wheel.ratio_sigma)
-        estimates[FACTOR + name] = Estimate(value, float(value * relative), scale.unit)
+        estimates[WHEEL_PREFIX + name] = Estimate(value, float(value * relative), scale.unit)
     reasons = _different_wheel_reasons(wheels)
     for width, (left, right) in _widths(names).items():
         estimates[width], width_reasons = _track_width(wheels[left], wheels[right],

@@ -125,41 +125,28 @@ def _transitions(path: Path, radius: float | None, drift_b: Floats) -> Floats:
 
     drift_b : (..., 3, 1) drift in b, rad/s.
     """
-    n = len(path.t) - 1
-    drift_b = np.broadcast_to(drift_b, (n, 3, 1))
-    chunk = 4096    # intervals at a time: in the cache it is three times as fast
-    return np.concatenate([np.eye(6, 7)[None], *(
-        _interval_transitions(path, slice(first, first + chunk), radius,
-                              drift_b[first:first + chunk]) for first in range(0, n, chunk))])
-
-
-def _interval_transitions(path: Path, intervals: slice, radius: float | None,
-                          drift_b: Floats) -> Floats:
-    """Return [A | B] of m consecutive intervals, (m, 6, 7), with their drift_b, (m, 3, 1)."""
-    epochs = slice(intervals.start, intervals.stop + 1)
-    dt = np.diff(path.t[epochs])[:, None, None]
-    latitude, height = ((a[:-1] + a[1:]) / 2 for a in (path.latitude[epochs], path.height[epochs]))
-    Fdt = coefficients(latitude, height, path.velocity_n[intervals], radius) * dt
-    C_nb = path.C_nb[epochs]
-    drift_angle = (C_nb[:-1] + C_nb[1:]) * (dt / 2) @ drift_b
+    dt = np.diff(path.t)[:, None, None]
+    latitude, height = ((a[:-1] + a[1:]) / 2 for a in (path.latitude, path.height))
+    Fdt = coefficients(latitude, height, path.velocity_n, radius) * dt
+    drift_angle = (path.C_nb[:-1] + path.C_nb[1:]) * (dt / 2) @ drift_b
     # exp(F dt) to second order: rates are of 1e-4 /s, the next term is 1e-13 in a second
     A = Fdt + Fdt @ Fdt / 2
     A[:, range(6), range(6)] += 1.0
     # the drift of an interval acts for half of it on average
     B = Fdt[..., :3] @ drift_angle / -2
     B[:, :3] -= drift_angle
-    return np.concatenate([A, B], axis=-1)
+    return np.concatenate([np.eye(6, 7)[None], np.concatenate([A, B], axis=-1)])
 
 
 def _from_first_epoch(transitions: Floats) -> Floats:
     """
     Return the transitions from the first epoch, from those between adjacent epochs: (n, 6, 7).
 
-    A parallel scan: blocks of transitions are composed side by side, then their ends by recursion.
+    A parallel scan: blocks of transitions are composed side by side, then the blocks by recursion.
     """
     composed = transitions.copy()
-    max_steps = 64    # of a block
-    width = min(max_steps, max(2, int(np.sqrt(len(composed)))))
+    max_width = 64    # transitions of a block
+    width = min(max_width, max(2, int(np.sqrt(len(composed)))))
     for k in range(1, min(width, len(composed))):
         step = composed[k::width]
         step[:] = _product(step, composed[k - 1::width][:len(step)])

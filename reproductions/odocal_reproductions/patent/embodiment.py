@@ -64,8 +64,6 @@ class Embodiment:
     rows: tuple[Row, ...]
     imbalance: float             # of the array of 81, see ``imbalance``
     orthogonal_rows: int         # fewest rows of an orthogonal array
-    best_of_array: Row
-    best_of_all: Row             # of the 441 combinations
     response_surface: SurfaceMinimum    # optimum within the range
     least_squares: SquaresMinimum       # optimum without a range
     radius: float                # m, nominal, of both wheels
@@ -155,15 +153,15 @@ def embodiment(leg: PlanarLeg, radius: float = NOMINAL_RADIUS,
         left, right, heading_deg = errors
         return row(name, np.array([left / radius, right / radius, np.deg2rad(heading_deg)]))
 
-    best = (row(f'best of {len(array)}', best_x), row(f'best of all {len(all_x)}', best_of_all_x))
     rows = [row_of('start values', (0.0, 0.0, 0.0))]
     rows += [row_of(f'printed {k}', errors) for k, errors in enumerate(PRINTED, 1)]
-    rows += [row_of('printed as best', PRINTED_BEST), *best,
+    rows += [row_of('printed as best', PRINTED_BEST), row(f'best of {len(array)}', best_x),
+             row(f'best of all {len(all_x)}', best_of_all_x),
              row('response surface', surface.x), row('  wheels together', surface_together.x),
              row('least squares', squares.x), row('  wheels together', squares_together.x)]
     rows += [] if truth is None else [row_of('truth', truth)]
-    return Embodiment(tuple(rows), imbalance(array, LEVELS), min_rows(LEVELS), *best, surface,
-                      squares, radius, mean_distances.reshape(LEVELS).min(axis=2))
+    return Embodiment(tuple(rows), imbalance(array, LEVELS), min_rows(LEVELS), surface, squares,
+                      radius, mean_distances.reshape(LEVELS).min(axis=2))
 
 
 def _errors_of(level_numbers: Ints, half_range: Floats) -> Floats:
