@@ -8,6 +8,7 @@ Errors of single legs average down, errors shared by all legs do not: docs/metho
 """
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,24 +40,24 @@ def combine_method(name: str, results: Sequence[MethodResult],
     walk_variance = np.zeros(len(results)) if walk_variance is None else walk_variance
     reasons: tuple[Reason, ...] = ()
     estimates: dict[str, Estimate] = {}
-    effects: dict[str, dict[int, Floats]] = {}      # of each source, by row of the parameter
+    effects: dict[str, Floats] = {}      # (p, k) of each source
     for i, parameter in enumerate(parameters):
         determined = [k for k, r in enumerate(results) if r.estimates[parameter].value is not None]
         unit = results[0].estimates[parameter].unit
         if not determined:
             estimates[parameter] = Estimate(None, None, unit)
             continue
-        value, variance, shared, scatter_reasons = _combine(
-            parameter, i, [results[k] for k in determined], walk_variance[determined])
-        reasons += scatter_reasons
-        derivative = value if parameter.startswith('scale_factor') else 1.0     # of K by ln K
-        sigma = abs(derivative) * float(np.sqrt(variance + sum(e @ e for e in shared.values())))
-        estimates[parameter] = Estimate(value, sigma, unit)
-        unshared = np.sqrt(variance) * np.eye(len(parameters))[i]
-        for source, effect in (shared | {'legs': unshared}).items():
-            effects.setdefault(source, {})[i] = effect
+        mean = _combine(parameter, i, [results[k] for k in determined], walk_variance[determined])
+        reasons += mean.reasons
+        derivative = mean.value if parameter.startswith('scale_factor') else 1.0    # of K by ln K
+        variance = mean.variance + sum(effect @ effect for effect in mean.shared.values())
+        estimates[parameter] = Estimate(mean.value, abs(derivative) * float(np.sqrt(variance)),
+                                        unit)
+        unshared = np.sqrt(mean.variance) * np.eye(len(parameters))[i]
+        for source, effect in (mean.shared | {'legs': unshared}).items():
+            effects.setdefault(source, np.zeros((len(parameters), len(effect))))[i] = effect
     estimates |= _scale_ratio(results, estimates) | last_leg_values(results, estimates)
-    sources = _make_sources(effects, len(parameters))
+    sources = tuple(Source(source, effect, source != 'legs') for source, effect in effects.items())
     details = known_budget(sources, parameters, estimates) if sources else {}
     return MethodResult(name, reasons, estimates, parameters, sources,
                         {'legs_used': len(results)} | details)
@@ -77,10 +78,18 @@ def last_leg_values(results: Sequence[MethodResult],
     return values
 
 
-def _combine(parameter: str, i: int, results: Sequence[MethodResult], walk_variance: Floats,
-             ) -> tuple[float, float, dict[str, Floats], tuple[Reason, ...]]:
-    """Return mean, unshared variance, shared effects by name, and reasons of parameter i."""
-    # docs/method.md (T14), (T15)
+class WeightedMean(NamedTuple):
+    """The combined value of a parameter."""
+
+    value: float
+    variance: float              # of errors that legs do not share; relative for a scale factor
+    shared: dict[str, Floats]    # (k,) effects of shared sources, by name
+    reasons: tuple[Reason, ...]
+
+
+def _combine(parameter: str, i: int, results: Sequence[MethodResult],
+             walk_variance: Floats) -> WeightedMean:
+    """Return the mean of parameter i, the i-th row of the sources: docs/method.md (T14), (T15)."""
     is_scale = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in results])
     y = np.log(x) if is_scale else x
@@ -110,7 +119,7 @@ def _combine(parameter: str, i: int, results: Sequence[MethodResult], walk_varia
         reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter}: the scatter of {len(y)} legs is '
                           f'{factor:.1f} times their uncertainties'),)
     mean = np.exp(mean) if is_scale else wrap(mean) if is_angle else mean
-    return float(mean), float(variance), shared, reasons
+    return WeightedMean(float(mean), float(variance), shared, reasons)
 
 
 def _shared_effects(i: int, results: Sequence[MethodResult]) -> dict[str, Floats]:
@@ -143,14 +152,3 @@ def _scale_ratio(results: Sequence[MethodResult],
         return {'scale_ratio': Estimate(None, None, '1')}
     nominal = first_scale / first_ratio
     return {'scale_ratio': Estimate(scale.value / nominal, scale.sigma / nominal, '1')}
-
-
-def _make_sources(effects: Mapping[str, Mapping[int, Floats]], p: int) -> tuple[Source, ...]:
-    """Return the error sources of p parameters from their effects, by name and row."""
-    sources = []
-    for name, by_row in effects.items():
-        matrix = np.zeros((p, max(map(len, by_row.values()))))
-        for i, effect in by_row.items():
-            matrix[i, :len(effect)] = effect
-        sources.append(Source(name, matrix, name != 'legs'))
-    return tuple(sources)

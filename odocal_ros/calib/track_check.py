@@ -9,7 +9,6 @@ stated sigmas of the fixes are too small, and whether the track is too far from 
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -133,33 +132,39 @@ def find_inliers(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
     return deviation <= OUTLIER_SIGMAS * sigma, sigma
 
 
-def errors_per_distance(path: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
+def compare_sections(path: Floats, before: Floats, after: Floats, configured: bool,
+                     ) -> tuple[tuple[PerDistance, ...], tuple[Reason, ...]]:
     """
     Return the rms errors of two tracks over sections of the path, each set to its first fix.
 
+    Also returns CHECK_WORSE if the second track is significantly farther from the fixes.
+
     path : (k,) path length at each fix, m.   before, after : (k, 3) track minus fixes, m, up to a
-    constant. The noise of the fixes is included.
+    constant, without and with calibration. The noise of the fixes is included.   configured : a
+    nominal scale is set.
     """
-    return tuple(PerDistance(errors.length, float(np.sqrt(errors.before.mean())),
-                             float(np.sqrt(errors.after.mean())), errors.pieces)
-                 for errors in _squared_errors(path, before, after))
-
-
-class SquaredErrors(NamedTuple):
-    """Squared errors of two tracks over p sections of one length: (p,) m^2."""
-
-    length: float     # m
-    pieces: float     # number of sections end to end: sections overlap
-    before: Floats
-    after: Floats
-
-
-def _squared_errors(path: Floats, before: Floats, after: Floats) -> list[SquaredErrors]:
-    """Return the squared errors for each of SECTION_LENGTHS_M that the path has."""
-    ends_by_length = {length: _section_ends(path, length) for length in SECTION_LENGTHS_M}
-    return [SquaredErrors(length, len(first) / SECTION_STARTS, *(
-        ((residual[last] - residual[first])[:, :2]**2).sum(axis=1) for residual in (
-            before, after))) for length, (first, last) in ends_by_length.items() if len(first)]
+    errors: list[PerDistance] = []
+    reasons: list[Reason] = []
+    for length in SECTION_LENGTHS_M:
+        first, last = _section_ends(path, length)
+        if not len(first):
+            continue
+        squares_before, squares_after = (
+            ((residual[last] - residual[first])[:, :2]**2).sum(axis=1)
+            for residual in (before, after))
+        mean_before, mean_after = squares_before.mean(), squares_after.mean()
+        rms_before, rms_after = float(np.sqrt(mean_before)), float(np.sqrt(mean_after))
+        pieces = len(first) / SECTION_STARTS      # number of sections end to end
+        errors.append(PerDistance(length, rms_before, rms_after, pieces))
+        increase = squares_after - squares_before
+        # fewer than three sections end to end have no known scatter; a tenth more is acceptable
+        if pieces >= 3 and mean_after >= 1.1**2 * mean_before \
+                and increase.mean() >= REMARK_SIGMAS * increase.std() / np.sqrt(pieces):
+            before_text = 'with the configured values' if configured else 'without calibration'
+            reasons.append(Reason(
+                Code.CHECK_WORSE, f'calibration makes the track worse: {rms_after:.2g} m rms from '
+                f'the fixes in sections of {length:g} m, {rms_before:.2g} m {before_text}'))
+    return tuple(errors), tuple(reasons[:1])
 
 
 def _section_ends(path: Floats, length: float) -> tuple[Ints, Ints]:
@@ -172,23 +177,3 @@ def _section_ends(path: Floats, length: float) -> tuple[Ints, Ints]:
     first, last = first[is_complete], last[is_complete]
     has_fixes = path[last] - path[first] <= 1.2 * length      # in longer ones fixes are missing
     return first[has_fixes], last[has_fixes]
-
-
-def worse_check_reasons(path: Floats, before: Floats, after: Floats,
-                        configured: bool) -> list[Reason]:
-    """
-    Return CHECK_WORSE if the correction significantly increases the distance to the fixes.
-
-    path, before, after : as for ``errors_per_distance``.   configured : a nominal scale is set.
-    """
-    for length, pieces, squares_before, squares_after in _squared_errors(path, before, after):
-        increase = squares_after - squares_before
-        rms_before, rms_after = np.sqrt([squares_before.mean(), squares_after.mean()])
-        # fewer than three sections end to end have no known scatter; a tenth more is acceptable
-        if pieces >= 3 and squares_after.mean() >= 1.1**2 * squares_before.mean() \
-                and increase.mean() >= REMARK_SIGMAS * increase.std() / np.sqrt(pieces):
-            before_text = 'with the configured values' if configured else 'without calibration'
-            return [Reason(Code.CHECK_WORSE, 'calibration makes the track worse: '
-                           f'{rms_after:.2g} m rms from the fixes in sections of {length:g} m, '
-                           f'{rms_before:.2g} m {before_text}')]
-    return []

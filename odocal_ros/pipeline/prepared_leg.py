@@ -230,15 +230,14 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
     for name, residuals in zip(('before', 'after'), section.residuals, strict=True):
         fields[name] = track_check.track_statistics(residuals, section.path_length)
     path_lengths = np.interp(prepared.inputs.t_fix[section.used], *path_length_over_time(prepared))
-    errors = path_lengths, section.residuals[0], section.residuals[1]
-    fields['per_distance'] = track_check.errors_per_distance(*errors)
+    fields['per_distance'], worse_reasons = track_check.compare_sections(
+        path_lengths, section.residuals[0], section.residuals[1], bool(prepared.nominal_scale))
     kept, outlier_reasons = without_outliers(prepared, after, start, section.used)
     evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
                              start, paths, prepared.config, prepared.t_fit, prepared.time_span)
     return fields | {'evidence': evidence}, (
-        *section.reasons, *track_check.worse_check_reasons(*errors, bool(prepared.nominal_scale)),
-        *outlier_reasons, *counter_change_reasons(evidence.sections, evidence.t_fix,
-                                                  evidence.fix_distance))
+        *section.reasons, *worse_reasons, *outlier_reasons, *counter_change_reasons(
+            evidence.sections, evidence.t_fix, evidence.fix_distance))
 
 
 def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:

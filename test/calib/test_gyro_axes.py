@@ -16,7 +16,7 @@ from odocal_ros.calib.gyro_axes import level_axes, wrong_axes_by_gravity
 from odocal_ros.calib.mounting import estimate_mounting
 from odocal_ros.data.samples import take
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.pipeline.calibrate import calibrate, faults, screen_leg
+from odocal_ros.pipeline.calibrate import calibrate, find_faults, screen_leg
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.gravity_fit import gravity_fit, GravityFit
 from odocal_ros.screening.screen import screen
@@ -48,7 +48,7 @@ def of_gyro(made, M=SAME, C=SAME, **options):
     """Return the reasons of a leg with gyro output M w and an IMU rotated by C (b to i)."""
     config = with_settings(settings(made), options)
     leg = with_imu(made, M @ C, f_i=lambda f: f @ C.T)
-    return {r.code: r for r in faults(screen_leg(leg, config), config)}
+    return {r.code: r for r in find_faults(screen_leg(leg, config), config)}
 
 
 X_MIRRORED, Y_MIRRORED = ({'f_i': lambda f, i=i: f * (1.0 - 2.0 * np.eye(3)[i])} for i in (0, 1))

@@ -9,7 +9,7 @@ import pytest
 
 from odocal_ros.calib.scale_variation import window_scale, WINDOWS
 from odocal_ros.calib.speed_scale import speed_scale
-from odocal_ros.calib.track_check import errors_per_distance, worse_check_reasons
+from odocal_ros.calib.track_check import compare_sections
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
@@ -18,6 +18,10 @@ RADIUS = 400.0
 PATH = np.arange(0.0, 3000.0, 1.0)
 TRUE = RADIUS * np.stack([np.sin(PATH / RADIUS), 1 - np.cos(PATH / RADIUS), 0 * PATH], -1)
 T = np.arange(0.0, 1800.0)
+
+
+def errors_per_distance(*tracks):
+    return compare_sections(*tracks, configured=True)[0]
 
 
 def wrong(scale=1.0, yaw=0.0):
@@ -56,13 +60,14 @@ def test_lengths_beyond_the_path_or_across_missing_fixes_are_left_out():
 
 def test_correction_that_increases_the_error_is_reported():
     noise = np.random.default_rng(1).normal(0.0, 0.5, TRUE.shape)
-    (reason,) = worse_check_reasons(PATH, wrong() + noise, wrong(1.02) + noise, configured=True)
+    _, (reason,) = compare_sections(PATH, wrong() + noise, wrong(1.02) + noise, configured=True)
     assert reason.code is Code.CHECK_WORSE
     # 2 % of the chord of 100 m and the noise of both ends, each axis
     assert f': {np.hypot(2.0, 1.0):.2g} m rms from the fixes in sections of 100 m' in reason.text
     assert ', 1 m with the configured values' in reason.text
-    assert worse_check_reasons(PATH, wrong(1.02) + noise, wrong() + noise, configured=True) == []
-    assert worse_check_reasons(PATH, wrong() + noise, wrong(1.0005) + noise, configured=True) == []
+    for scales in ((1.02, 1.0), (1.0, 1.0005)):
+        tracks = [wrong(scale) + noise for scale in scales]
+        assert compare_sections(PATH, *tracks, configured=True)[1] == ()
 
 
 def driven(seed=0):

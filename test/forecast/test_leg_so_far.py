@@ -14,7 +14,7 @@ from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
 from odocal_ros.forecast.progress import OdometerProgress, Progress
 from odocal_ros.forecast.quantities import find_observable
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
-from odocal_ros.pipeline.calibrate import calibrate, faults, screen_leg
+from odocal_ros.pipeline.calibrate import calibrate, find_faults, screen_leg
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
@@ -51,7 +51,7 @@ def test_faults_during_the_recording_are_those_of_the_result(made, wrong):
     # a method reports the gap as slip
     lowering = {r.code for r in result.reasons
                 if r.code.severity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
-    assert {r.code for r in faults(screen_leg(leg, config), config)} == lowering
+    assert {r.code for r in find_faults(screen_leg(leg, config), config)} == lowering
     assert {r.code for r in faults_in_cells(thinned(leg).leg(leg.start_ns), config)} == lowering
     assert (lowering == set()) == (wrong == 'sound')
 

@@ -9,7 +9,7 @@ receives: attitude errors phi in ENU, computed = (I - [phi x]) true, at the end 
 and a gyro drift, which is missing in the gyro bias that the pipeline subtracts from there on.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,9 +114,7 @@ class PaperDrive:
         state = motion.at(t)
         path = planned_path(t - self.start, state.speed, state.yaw, state.latitude[0],
                             state.longitude[0], state.height[0])
-        C_vb = imu_rotation(self.drive.options)
-        return Path(path.t, path.latitude, path.longitude, path.height, path.velocity_n,
-                    path.C_nb @ C_vb)
+        return replace(path, C_nb=path.C_nb @ imu_rotation(self.drive.options))
 
     def profile(self) -> SpeedProfile:
         """Return the distribution of distance over time from the end of the standstill."""
