@@ -193,8 +193,7 @@ def raise_on_overflow() -> np.errstate:
     return np.errstate(over='raise', divide='raise', invalid='raise')
 
 
-def failed_result(refuse: Callable[[Reason], MethodResult], name: str,
-                  error: Exception) -> MethodResult:
+def failure(refuse: Callable[[Reason], MethodResult], name: str, error: Exception) -> MethodResult:
     """Return the result of a method that raised; refuse: returns a result without values."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     text = ' '.join(str(error).split())[:200]

@@ -15,21 +15,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav import rotations
-from odocal_ros.nav.alignment import (
-    Alignment,
-    COMPASS_LIMIT,
-    COURSE_DISTANCE,
-    earth_rate_deviation,
-    gyrocompass,
-    HEADING_LIMIT,
-    level_at_rest,
-    level_in_motion,
-    LevelAttitude,
-    make_alignment,
-    MOTION_LEVEL,
-    REST_EDGE,
-)
+from odocal_ros.nav import alignment as nav_alignment, rotations
+from odocal_ros.nav.alignment import Alignment, LevelAttitude, make_alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin
 from odocal_ros.nav.geodesy import C_en
 from odocal_ros.nav.strapdown import attitude
@@ -77,6 +64,18 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     return make_alignment(level, *heading, origin, grade, gyro_noise), reasons
 
 
+def attitude_of(inputs: Inputs, origin: Origin, t_begin: float, q_nb: Floats,
+                gyro_bias: Floats) -> tuple[Floats, Floats]:
+    """Return the attitude from ``t_begin``, s, to the end: t (m,) s, q_nb (m, 4)."""
+    rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
+                 np.searchsorted(inputs.t_imu, inputs.t_stop + 1.0, side='right'))
+    t = inputs.t_imu[rows]
+    rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
+    epoch_rate = 50.0    # Hz, least rate of attitude epochs
+    return attitude(t, inputs.w_b[rows], q_nb, origin.earth_rate_n,
+                    max(1, int(rate / epoch_rate)), gyro_bias)
+
+
 def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
                        epochs: tuple[Floats, Floats], earth_rate_n: Floats) -> Alignment:
     """
@@ -86,7 +85,8 @@ def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
     """
     walk_variances = []
     for begin, end in spans[spans[:, 0] > alignment.t] if alignment.standstill else ():
-        rows = slice(*np.searchsorted(inputs.t_imu, (begin + REST_EDGE, end - REST_EDGE)))
+        edge = nav_alignment.REST_EDGE
+        rows = slice(*np.searchsorted(inputs.t_imu, (begin + edge, end - edge)))
         t = inputs.t_imu[rows]
         if len(t) < MIN_AT_REST:
             continue
@@ -123,10 +123,11 @@ def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float,
                     ) -> tuple[LevelAttitude, tuple[Reason, ...]]:
     """Return the level at a standstill, or at the start of the drive without one, and reasons."""
     if span is not None:
-        return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, gyro_noise), ()
+        return nav_alignment.level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade,
+                                           gyro_noise), ()
     t = inputs.t_imu
     first = max(0.0, float(t[0]))
-    rows = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
+    rows = (t >= first) & (t <= min(first + nav_alignment.MOTION_LEVEL, inputs.t_stop))
     if rows.sum() < 2:      # the IMU ends at the mark, which IMU_GAP reports
         rows = np.abs(t - first) <= np.sort(np.abs(t - first))[1]
     _, q_0b = attitude(t[rows], inputs.w_b[rows], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
@@ -134,8 +135,8 @@ def _estimate_level(inputs: Inputs, span: Floats | None, metres_per_unit: float,
     begin, end = (np.clip(t[rows][[0, -1]] + half, *inputs.travel.t[[0, -1]])
                   for half in (-0.5, 0.5))
     travel = (inputs.travel.at(end) - inputs.travel.at(begin)) * metres_per_unit
-    level = level_in_motion(t[rows], inputs.f_b[rows], q_0b,
-                            travel / np.maximum(end - begin, 1e-3), latitude, grade)
+    level = nav_alignment.level_in_motion(t[rows], inputs.f_b[rows], q_0b,
+                                          travel / np.maximum(end - begin, 1e-3), latitude, grade)
     reason = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level estimated '
                     f'over {t[rows][-1] - t[rows][0]:.0f} s of driving, gyro bias unknown '
                     f'(± {np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
@@ -236,9 +237,9 @@ def _heading_from_orientations(t: Floats, q: Floats, variance: Floats, C_ib: Flo
     yaw = np.arctan2(C_nb[:, 1, 0].mean(), C_nb[:, 0, 0].mean()) + offset
     stated_variance = float(np.median(variance[usable]))
     sigma = np.sqrt(stated_variance) if stated_variance > 0 else config.alignment.heading_sigma
-    if sigma > HEADING_LIMIT:
+    if sigma > nav_alignment.HEADING_LIMIT:
         return None, (f'its sigma is {np.rad2deg(sigma):.3g} deg; the limit is '
-                      f'{np.rad2deg(HEADING_LIMIT):.3g} deg')
+                      f'{np.rad2deg(nav_alignment.HEADING_LIMIT):.3g} deg')
     return (float(rotations.wrap(yaw)), float(sigma)), ''
 
 
@@ -249,12 +250,12 @@ def _heading_by_gyrocompass(inputs: Inputs, level: LevelAttitude, latitude: floa
         return None, 'the positions are in a local frame, whose y axis does not point to north'
     if level.standstill is None:
         return None, 'needs a standstill'
-    yaw, sigma = gyrocompass(level, latitude, grade)
-    if sigma > COMPASS_LIMIT:
+    yaw, sigma = nav_alignment.gyrocompass(level, latitude, grade)
+    if sigma > nav_alignment.COMPASS_LIMIT:
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) causes a '
                       f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg; '
-                      f'the limit is {np.rad2deg(COMPASS_LIMIT):.1f} deg')
-    deviation = earth_rate_deviation(level, latitude, grade)
+                      f'the limit is {np.rad2deg(nav_alignment.COMPASS_LIMIT):.1f} deg')
+    deviation = nav_alignment.earth_rate_deviation(level, latitude, grade)
     no_earth_sigmas = 4.0    # sigmas: with a larger bias there is no gyrocompass
     if deviation > no_earth_sigmas:
         return None, (f'the turn rate at rest differs from the Earth rate by {deviation:.0f} '
@@ -280,7 +281,7 @@ def _heading_by_course(inputs: Inputs, level: LevelAttitude, metres_per_unit: fl
         dead_reckoned = track.P_at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
         dead_reckoned = dead_reckoned - dead_reckoned[0]
         sigma_fix = np.sqrt(np.median(inputs.covariance_n[selected, 0, 0]))
-        min_distance = max(COURSE_DISTANCE, 8 * sigma_fix)
+        min_distance = max(nav_alignment.COURSE_DISTANCE, 8 * sigma_fix)
         distance = np.hypot(*dead_reckoned.T)
         if (distance >= min_distance).any():
             k = int(np.argmax(distance >= min_distance))

@@ -12,13 +12,7 @@ import numpy as np
 
 from odocal_ros.calib import choice
 from odocal_ros.calib.drive import path_and_chord
-from odocal_ros.calib.result import (
-    AS_SENT,
-    failed_result,
-    LegResult,
-    MethodResult,
-    raise_on_overflow,
-)
+from odocal_ros.calib.result import AS_SENT, failure, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.calib.two_point import refused_result
 from odocal_ros.data.arrays import release_mapped_memory
 from odocal_ros.data.leg import Leg
@@ -120,7 +114,7 @@ def _run_guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]
             Code.NOT_CONVERGED, f'{name} did not converge: an estimate became infinite or '
             'NaN. Likely cause: invalid or missing samples')))
     except Exception as error:      # its reasons may be wrong too and are dropped
-        return MethodRun(failed_result(partial(REFUSED_RESULTS[name], inputs), name, error))
+        return MethodRun(failure(partial(REFUSED_RESULTS[name], inputs), name, error))
 
 
 def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],

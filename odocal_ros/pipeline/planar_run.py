@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.calib.choice import PLANAR
 from odocal_ros.calib.planar import run as planar
 from odocal_ros.calib.planar.result import make_planar_result, refused_planar_result
-from odocal_ros.calib.result import failed_result, LegResult, MethodResult, raise_on_overflow
+from odocal_ros.calib.result import failure, LegResult, MethodResult, raise_on_overflow
 from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
@@ -80,7 +80,7 @@ def _fit_guarded(run: planar.Run, inputs: Inputs, config: settings.Config,
     except (OdocalError, MemoryError):
         raise
     except Exception as error:
-        return failed_result(unknown, PLANAR, error), {}
+        return failure(unknown, PLANAR, error), {}
 
 
 def _make_run(inputs: Inputs, config: settings.Config) -> tuple[planar.Run | None, list[Reason]]:

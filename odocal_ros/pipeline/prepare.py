@@ -17,9 +17,9 @@ from odocal_ros.data.arrays import release_mapped_memory, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
-from odocal_ros.pipeline.align import align, with_observed_walk
+from odocal_ros.pipeline.align import align, attitude_of, with_observed_walk
 from odocal_ros.pipeline.beyond_model import coarse_reasons
-from odocal_ros.pipeline.prepared_leg import attitude_of, PreparedLeg
+from odocal_ros.pipeline.prepared_leg import PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import imu_orientation
 from odocal_ros.screening.axles import pair_wheels

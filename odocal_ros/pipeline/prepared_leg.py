@@ -27,7 +27,6 @@ from odocal_ros.data.arrays import Bools, Floats, map_rows, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav import dead_reckoning
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.strapdown import attitude
 from odocal_ros.nav.time_series import integral_at
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_orientation import ImuOrientation
@@ -133,6 +132,56 @@ class PreparedLeg(LocatedFixes):
             travel.at(t[inside]), self.level_path(t[inside]), self.fixes_n[inside, :2],
             max(self.inputs.min_motion, 8 * self.fix_sigma))
 
+    def path_length_over_time(self) -> tuple[Floats, Floats]:
+        """Return times of the track, s, and path length up to them, m."""
+        path_length = running_sum(np.abs(np.diff(self.track.s)))
+        return self.track.t, path_length * self.metres_per_unit
+
+    def configured_forward(self, f: Floats, estimates: Mapping[str, Estimate]) -> Floats:
+        """
+        Return f of the settings, (3,) m per unit of travel; without a scale, with the path ratio.
+
+        f : as estimated; its angles are kept if ``estimates`` has no value of them.
+        """
+        determined = {name for name, e in estimates.items() if e.value is not None}
+        angles = [0.0 if name in determined else angle for name, angle in zip(
+            ('yaw_mounting_angle', 'pitch_mounting_angle'),
+            dead_reckoning.mounting_from_forward(f), strict=True)]
+        scale = self.nominal_scale or self.path_ratio or self.rough_scale
+        return scale * dead_reckoning.forward_b(*angles)
+
+    def find_inliers(self, path: Path, anchor: MarkFix,
+                     selected: Bools) -> tuple[Bools, tuple[Reason, ...]]:
+        """
+        Return a mask of fixes that are no gross outliers from a fitted path, (k,), and reasons.
+
+        anchor : mark whose position the path is set to.   selected : (k,) fixes that are tested.
+        """
+        if not selected.any():
+            return selected, ()
+        fixes = self.inputs.t_fix, self.fixes_n
+        residuals = track_check.track_residuals(path, anchor, fixes)
+        distances = np.hypot(*residuals[:, :2].T)
+        # 20 times the usual distance from the track: a certain outlier
+        limit_m = 20.0 * max(float(np.median(distances[selected])), self.fix_sigma)
+        is_outlier = distances > limit_m
+        count = int((is_outlier & selected).sum())
+        return ~is_outlier, (Reason(
+            Code.BAD_ROWS_DROPPED, f'{count} of {int(selected.sum())} fixes are more than '
+            f'{limit_m:.0f} m from the track; not used in the check',
+            'Check the receiver and its sky view, or the localisation.'),) * bool(count)
+
+    def find_slips(self, track: dead_reckoning.Track, f: Floats,
+                   interval: tuple[float, float]) -> Slips:
+        """Return the slips of the mean wheel in an interval, s, without those of one wheel."""
+        if not self.inputs.has_accelerometer:
+            return Slips(np.empty(0), np.empty(0))
+        slips = find_slips(self.inputs.t_imu, self.inputs.f_b, track, f,
+                           self.origin.latitude, count_size(self.inputs.travel))
+        is_single_wheel = (np.abs(slips.t[:, None] - self.wheel_slips.t) < SLIP_WINDOW).any(axis=1)
+        kept = (slips.t >= interval[0]) & (slips.t <= interval[1]) & ~is_single_wheel
+        return Slips(slips.t[kept], slips.size[kept], slips.delay, slips.travel_error_sign[kept])
+
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
         """Return the antenna's position at t by fixes or surveyed mark, None without either."""
         point, span = self._surveyed_point(name, t), standing_at(t, self.standstills)
@@ -160,55 +209,6 @@ class PreparedLeg(LocatedFixes):
         return point if is_there else ()
 
 
-def attitude_of(inputs: Inputs, origin: dead_reckoning.Origin, t_begin: float, q_nb: Floats,
-                gyro_bias: Floats) -> tuple[Floats, Floats]:
-    """Return the attitude from ``t_begin``, s, to the end: t (m,) s, q_nb (m, 4)."""
-    rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
-                 np.searchsorted(inputs.t_imu, inputs.t_stop + 1.0, side='right'))
-    t = inputs.t_imu[rows]
-    rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
-    epoch_rate = 50.0    # Hz, least rate of attitude epochs
-    return attitude(t, inputs.w_b[rows], q_nb, origin.earth_rate_n,
-                    max(1, int(rate / epoch_rate)), gyro_bias)
-
-
-def configured_forward(prepared: PreparedLeg, f: Floats,
-                       estimates: Mapping[str, Estimate]) -> Floats:
-    """
-    Return f of the settings, (3,) m per unit of travel; without a scale, with the path ratio.
-
-    f : as estimated; its angles are kept if ``estimates`` has no value of them.
-    """
-    determined = {name for name, e in estimates.items() if e.value is not None}
-    angles = [0.0 if name in determined else angle for name, angle in zip(
-        ('yaw_mounting_angle', 'pitch_mounting_angle'),
-        dead_reckoning.mounting_from_forward(f), strict=True)]
-    scale = prepared.nominal_scale or prepared.path_ratio or prepared.rough_scale
-    return scale * dead_reckoning.forward_b(*angles)
-
-
-def without_outliers(prepared: PreparedLeg, path: Path, anchor: MarkFix,
-                     selected: Bools) -> tuple[Bools, tuple[Reason, ...]]:
-    """
-    Return a mask of fixes that are no gross outliers from a fitted path, (k,), and reasons.
-
-    anchor : mark whose position the path is set to.   selected : (k,) fixes to test and report.
-    """
-    if not selected.any():
-        return selected, ()
-    fixes = prepared.inputs.t_fix, prepared.fixes_n
-    residuals = track_check.track_residuals(path, anchor, fixes)
-    distances = np.hypot(*residuals[:, :2].T)
-    # 20 times the usual distance from the track: a certain outlier
-    limit_m = 20.0 * max(float(np.median(distances[selected])), prepared.fix_sigma)
-    is_outlier = distances > limit_m
-    count = int((is_outlier & selected).sum())
-    return ~is_outlier, (Reason(
-        Code.BAD_ROWS_DROPPED, f'{count} of {int(selected.sum())} fixes are more than '
-        f'{limit_m:.0f} m from the track; not used in the check',
-        'Check the receiver and its sky view, or the localisation.'),) * bool(count)
-
-
 def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
                                                                 tuple[Reason, ...]]:
     """Return tracks, checks and evidence of a leg as fields of its result, and reasons."""
@@ -229,10 +229,11 @@ def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
         return fields, section.reasons
     for name, residuals in zip(('before', 'after'), section.residuals, strict=True):
         fields[name] = track_check.track_statistics(residuals, section.path_length)
-    path_lengths = np.interp(prepared.inputs.t_fix[section.used], *path_length_over_time(prepared))
+    t_fix = prepared.inputs.t_fix[section.used]
+    path_lengths = np.interp(t_fix, *prepared.path_length_over_time())
     fields['per_distance'], worse_reasons = track_check.compare_sections(
         path_lengths, section.residuals[0], section.residuals[1], bool(prepared.nominal_scale))
-    kept, outlier_reasons = without_outliers(prepared, after, start, section.used)
+    kept, outlier_reasons = prepared.find_inliers(after, start, section.used)
     evidence = make_evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept,
                              start, paths, prepared.config, prepared.t_fit, prepared.time_span)
     return fields | {'evidence': evidence}, (
@@ -272,28 +273,10 @@ def _compare(prepared: PreparedLeg, paths: Sequence[Path], start: MarkFix) -> Co
     used = (prepared.inputs.t_fix >= begin) & (prepared.inputs.t_fix <= end)
     residuals = []
     if anchor is not None:
-        inside, reasons = without_outliers(prepared, paths[-1], anchor, used)
+        inside, reasons = prepared.find_inliers(paths[-1], anchor, used)
         used &= inside
         fixes = prepared.inputs.t_fix[used], prepared.fixes_n[used]
         residuals = [track_check.track_residuals(path, anchor, fixes) for path in paths] \
             if used.sum() >= MIN_TRACK_FIXES else []
-    begin_m, end_m = np.interp([begin, end], *path_length_over_time(prepared))
+    begin_m, end_m = np.interp([begin, end], *prepared.path_length_over_time())
     return Comparison(used, residuals, end_m - begin_m, reasons)
-
-
-def path_length_over_time(prepared: PreparedLeg) -> tuple[Floats, Floats]:
-    """Return times of the track, s, and path length up to them, m."""
-    path_length = running_sum(np.abs(np.diff(prepared.track.s)))
-    return prepared.track.t, path_length * prepared.metres_per_unit
-
-
-def slip_check(prepared: PreparedLeg, track: dead_reckoning.Track, f: Floats,
-               interval: tuple[float, float]) -> Slips:
-    """Return the slips of the mean wheel in an interval, s, without those of one wheel."""
-    if not prepared.inputs.has_accelerometer:
-        return Slips(np.empty(0), np.empty(0))
-    slips = find_slips(prepared.inputs.t_imu, prepared.inputs.f_b, track, f,
-                       prepared.origin.latitude, count_size(prepared.inputs.travel))
-    is_single_wheel = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SLIP_WINDOW).any(axis=1)
-    kept = (slips.t >= interval[0]) & (slips.t <= interval[1]) & ~is_single_wheel
-    return Slips(slips.t[kept], slips.size[kept], slips.delay, slips.travel_error_sign[kept])

@@ -20,15 +20,8 @@ from odocal_ros.data.arrays import Floats, release_mapped_memory
 from odocal_ros.estimator import make_smoother_leg, smooth
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.prepared_leg import (
-    attitude_of,
-    configured_forward,
-    MethodRun,
-    PassCallback,
-    Paths,
-    PreparedLeg,
-    slip_check,
-)
+from odocal_ros.pipeline.align import attitude_of
+from odocal_ros.pipeline.prepared_leg import MethodRun, PassCallback, Paths, PreparedLeg
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 
@@ -59,10 +52,10 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     as_sent = method.estimates.get('scale_factor_as_sent')
     if as_sent is not None:        # the travel here is that of uncorrected speeds
         f = f * (as_sent.value or 0.0) / np.linalg.norm(f)
-    before = prepared.path(configured_forward(prepared, f, method.estimates),
+    before = prepared.path(prepared.configured_forward(f, method.estimates),
                            dead_reckon(t, q_nb, travel))
     # of coarse speeds the fit only uses the steps: slip is detected by this track
-    odometer = slip_reasons(slip_check(prepared, track, f, (0.0, prepared.t_fit)),
+    odometer = slip_reasons(prepared.find_slips(track, f, (0.0, prepared.t_fit)),
                             prepared.config.odometer.time_offset) if leg.uses_speed_steps else ()
     return MethodRun(method, Paths(before, _delayed_path(track, f, lever_b, delays_s['gnss'])),
                      delays=observed_delays, odometer_reasons=odometer)

@@ -23,15 +23,7 @@ from odocal_ros.calib.two_point import (
 )
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.pipeline.prepared_leg import (
-    configured_forward,
-    MethodRun,
-    PassCallback,
-    Paths,
-    PreparedLeg,
-    slip_check,
-    without_outliers,
-)
+from odocal_ros.pipeline.prepared_leg import MethodRun, PassCallback, Paths, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_orientation import corrected_forward_axis
 
@@ -67,8 +59,8 @@ class TwoPointRun:
         f = solve_level(two_point)
         t_fix = self.inputs.t_fix
         between = (t_fix >= two_point.start.t) & (t_fix <= two_point.end.t)
-        is_inlier, outlier_reasons = without_outliers(self.prepared, self.prepared.path(f),
-                                                      two_point.start, between)
+        is_inlier, outlier_reasons = self.prepared.find_inliers(
+            self.prepared.path(f), two_point.start, between)
         between &= is_inlier
         self.data_reasons += outlier_reasons
         factor = np.ones(3)
@@ -83,7 +75,7 @@ class TwoPointRun:
             method.estimates, self.prepared.nominal_scale, self.config)))
         f = method.details['f']
         paths = Paths(*map(self.prepared.path,
-                           (configured_forward(self.prepared, f, method.estimates), f)))
+                           (self.prepared.configured_forward(f, method.estimates), f)))
         return MethodRun(method, paths, tuple(self.data_reasons),
                          odometer_reasons=self.slip_reasons)
 
@@ -93,7 +85,7 @@ class TwoPointRun:
             return np.empty(0), np.empty(0)
         ends = two_point.start.t, two_point.end.t
         forward = corrected_forward_axis(self.prepared.imu_orientation, f)
-        slips = slip_check(self.prepared, self.track, forward, ends)
+        slips = self.prepared.find_slips(self.track, forward, ends)
         self.slip_reasons = slip_reasons(slips, self.config.odometer.time_offset)
         wheel_slips = self.prepared.wheel_slips      # of single wheels: 1 / count in the mean
         inside = (wheel_slips.t >= ends[0]) & (wheel_slips.t <= ends[1])

@@ -19,6 +19,7 @@ from odocal_ros.nav.rotations import exp_so3, matrix_from_quat, quat_from_matrix
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.sim.motion import attitude as true_attitude
 from odocal_ros.sim.scenarios import SimOptions, simulate
+from odocal_ros.sim.sensors import imu_rotation
 
 pytestmark = pytest.mark.core
 RATE = 100.0
@@ -35,13 +36,8 @@ def town():
     t = (drive.imu.stamp_ns - drive.options.start_ns) * 1e-9
     state = drive.motion.at(t)
     start = np.array([state.latitude[0], state.longitude[0], state.height[0]])
-    C_nb = true_attitude(drive.motion.at(t[:1]))[0] @ _C_vb(drive.options)
+    C_nb = true_attitude(drive.motion.at(t[:1]))[0] @ imu_rotation(drive.options)
     return t, drive.imu.w_i, Travel(t, state.travel, 0.0), start, C_nb
-
-
-def _C_vb(options):
-    from odocal_ros.sim.sensors import imu_rotation
-    return imu_rotation(options)
 
 
 def reckon(town, x_0, eps_b):

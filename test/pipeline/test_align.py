@@ -10,8 +10,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.pipeline.align import choose_standstill, with_observed_walk
-from odocal_ros.pipeline.prepared_leg import attitude_of
+from odocal_ros.pipeline.align import attitude_of, choose_standstill, with_observed_walk
 from odocal_ros.reasons import Code
 from odocal_ros.settings.nominal import GRADES
 

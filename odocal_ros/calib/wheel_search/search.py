@@ -15,12 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.wheel_search.minimisation import (
-    least_squares,
-    refine,
-    SquaresMinimum,
-    SurfaceMinimum,
-)
+from odocal_ros.calib.wheel_search import minimisation
 from odocal_ros.calib.wheel_search.parameter_sets import (
     design_for,
     NAMES,
@@ -51,9 +46,9 @@ class SearchResult:
     # smallest maximum distance
     best: int
     ratio_is_fixed: bool        # True: fixes do not separate left and right: ratio as in ``start``
-    surface_minimum: SurfaceMinimum
-    squares_minimum: SquaresMinimum    # by least squares
-    free_minimum: SquaresMinimum       # by least squares, ratio of left and right not fixed
+    surface_minimum: minimisation.SurfaceMinimum
+    squares_minimum: minimisation.SquaresMinimum    # by least squares
+    free_minimum: minimisation.SquaresMinimum       # by least squares, ratio never fixed
     surface_set: Floats         # (3,) at ``surface_minimum``: the result of the search
     squares_set: Floats         # (3,) at ``squares_minimum``
     start_scores: Scores        # of the start values, one row
@@ -124,12 +119,12 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     sets = parameter_sets(leg, x)
     scores = score(leg, sets, robust)
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
-    free = squares = least_squares(leg, x[best], Space(ratio_is_fixed=False), robust)
+    free = squares = minimisation.least_squares(leg, x[best], Space(ratio_is_fixed=False), robust)
     # half ranges are 2 sigma: the ratio is fixed if the fixes do not reduce its sigma
     ratio_is_fixed = not free.sigma_difference <= difference_limit(ranges)
     space = Space(ratio_is_fixed)
     if ratio_is_fixed:
-        squares = least_squares(leg, x[best], space, robust)
+        squares = minimisation.least_squares(leg, x[best], space, robust)
     surface = _refine(leg, x[best], ranges, space, robust)
     surface_set, squares_set = (parameter_sets(leg, fit.x)[0] for fit in (surface, squares))
     surface_set[2], squares_set[2] = wrap(surface_set[2]), wrap(squares_set[2])
@@ -147,22 +142,22 @@ def difference_limit(ranges: Ranges) -> float:
 
 
 def _refine(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space,
-            robust: bool) -> SurfaceMinimum:
+            robust: bool) -> minimisation.SurfaceMinimum:
     """Return the minimum of the mean square; if robust, from there that of Huber's mean."""
     # far from its minimum, Huber's mean is a cone, which a polynomial does not fit
     def criterion(robust: bool) -> Callable[..., Any]:
         return lambda x: score(leg, parameter_sets(leg, x), robust, course=False).loss
 
-    by_squares = refine(criterion(False), x, ranges.step, ranges.half_range, space)
+    by_squares = minimisation.refine(criterion(False), x, ranges.step, ranges.half_range, space)
     if not robust:
         return by_squares
-    by_huber = refine(criterion(True), by_squares.x, ranges.step / 10, by_squares.half_range,
-                      space)
+    by_huber = minimisation.refine(criterion(True), by_squares.x, ranges.step / 10,
+                                   by_squares.half_range, space)
     return replace(by_huber, widened=by_squares.widened or by_huber.widened,
                    first=by_squares.first, iterations=by_squares.iterations + by_huber.iterations)
 
 
-def _not_separable(ranges: Ranges, free: SquaresMinimum) -> Reason:
+def _not_separable(ranges: Ranges, free: minimisation.SquaresMinimum) -> Reason:
     """Return the reason that left and right scale cannot be separated."""
     sigma = 100 * free.sigma_difference
     sigma_text = f'{sigma:.2g} %' if sigma < 100 else '100 % or more'
@@ -173,8 +168,8 @@ def _not_separable(ranges: Ranges, free: SquaresMinimum) -> Reason:
         'search changed both together')
 
 
-def _convergence_reasons(ranges: Ranges, surface: SurfaceMinimum,
-                         squares: SquaresMinimum) -> list[Reason]:
+def _convergence_reasons(ranges: Ranges, surface: minimisation.SurfaceMinimum,
+                         squares: minimisation.SquaresMinimum) -> list[Reason]:
     """Return the reasons if the search range was widened, or the search has not converged."""
     reasons = []
     if surface.widened:

@@ -51,18 +51,14 @@ def coefficients(latitude: Floats | float, height: Floats | float,
     vE, vN, vU = np.moveaxis(np.asarray(velocity_n, dtype=float), -1, 0)
     s, c = np.sin(latitude), np.cos(latitude)
     tan, sec = s / c, 1 / c
-    RM: Floats | float
-    RN: Floats | float
-    dRM: Floats | float
-    dRN: Floats | float
     if radius is None:
         meridian, normal = radii(latitude)
         RM, RN = meridian + height, normal + height
         dlnRN = E2 * s * c / (1 - E2 * s * s)      # d ln RN / dL; d ln RM / dL is 3 times as large
         dRM, dRN, by_height = 3 * dlnRN * meridian, dlnRN * normal, 1.0
     else:
-        RM = RN = float(radius)
-        dRM = dRN = by_height = 0.0
+        RM = RN = np.asarray(radius, float)
+        dRM, dRN, by_height = 0.0 * RM, 0.0 * RN, 0.0
         vU = np.zeros_like(vU)
     F = np.zeros((*np.broadcast(latitude, vE).shape, 6, 6))
     # phi x omega_in of the attitude rows
@@ -84,8 +80,8 @@ def coefficients(latitude: Floats | float, height: Floats | float,
     return F
 
 
-def _velocity_error_effects(velocity_n: tuple[Floats, Floats, Floats], RM: Floats | float,
-                            RN: Floats | float, tan: Floats, sec: Floats) -> Floats:
+def _velocity_error_effects(velocity_n: tuple[Floats, Floats, Floats], RM: Floats, RN: Floats,
+                            tan: Floats, sec: Floats) -> Floats:
     """
     Return the rates of the states by phi through the velocity error v x phi of (21): (..., 6, 3).
 
@@ -96,13 +92,9 @@ def _velocity_error_effects(velocity_n: tuple[Floats, Floats, Floats], RM: Float
     zero = np.zeros_like(vE)
     dv_E, dv_N, dv_U = (np.stack(row, -1) for row in (
         (zero, -vU, vN), (vU, zero, -vE), (-vN, vE, zero)))
-    by_north, by_east = dv_N / _column(RM), dv_E / _column(RN)
-    return np.stack([-by_north, by_east, by_east * _column(tan),      # in omega_in
-                     by_north, by_east * _column(sec), dv_U], -2)     # (18), (22); (19), (23)
-
-
-def _column(x: Floats | float) -> Floats:
-    return np.asarray(x)[..., None]
+    by_north, by_east = dv_N / RM[..., None], dv_E / RN[..., None]
+    return np.stack([-by_north, by_east, by_east * tan[..., None],      # in omega_in
+                     by_north, by_east * sec[..., None], dv_U], -2)     # (18), (22); (19), (23)
 
 
 def propagate(path: Path, x_0: Floats | list[float], eps_b: Floats | list[float],

@@ -19,12 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.wheel_search.minimisation import (
-    least_squares,
-    refine,
-    SquaresMinimum,
-    SurfaceMinimum,
-)
+from odocal_ros.calib.wheel_search import minimisation
 from odocal_ros.calib.wheel_search.parameter_sets import (
     bose,
     full_factorial,
@@ -64,8 +59,8 @@ class Embodiment:
     rows: tuple[Row, ...]
     imbalance: float             # of the array of 81, see ``imbalance``
     orthogonal_rows: int         # fewest rows of an orthogonal array
-    response_surface: SurfaceMinimum    # optimum within the range
-    least_squares: SquaresMinimum       # optimum without a range
+    response_surface: minimisation.SurfaceMinimum    # optimum within the range
+    least_squares: minimisation.SquaresMinimum       # optimum without a range
     radius: float                # m, nominal, of both wheels
     mean_distance: NDArray[np.float64]    # (7, 7) m by left and right radius, of the best heading
 
@@ -140,9 +135,10 @@ def embodiment(leg: PlanarLeg, radius: float = NOMINAL_RADIUS,
     step = 2 * half_range / (np.array(LEVELS) - 1)
     spaces = Space(ratio_is_fixed=False), Space(ratio_is_fixed=True)
     surface, surface_together = (
-        refine(lambda x: score(leg, parameter_sets(leg, x), course=False).loss, best_x, step,
-               half_range, space, widen=False) for space in spaces)
-    squares, squares_together = (least_squares(leg, best_x, space) for space in spaces)
+        minimisation.refine(lambda x: score(leg, parameter_sets(leg, x), course=False).loss,
+                            best_x, step, half_range, space, widen=False) for space in spaces)
+    squares, squares_together = (
+        minimisation.least_squares(leg, best_x, space) for space in spaces)
 
     def row(name: str, x: Floats) -> Row:
         criteria = score(leg, parameter_sets(leg, x)).row(0)
