@@ -202,11 +202,8 @@ def total_covariance(sources: Iterable[Source]) -> Floats:
 
 def budget_table(sources: Iterable[Source], parameters: Sequence[str],
                  scale: Sequence[float] | Floats) -> dict[str, dict[str, float | bool]]:
-    """
-    Return the one-sigma effect of each source, and ``shared``: the same error in all legs.
-
-    scale : (p,) factors on effects (K of ln K).
-    """
+    """Return one-sigma effects by source and parameter, times ``scale``, (p,) (K of ln K)."""
+    # shared : the error is the same in all legs
     return {s.name: {p: float(np.linalg.norm(s.effects[i]) * scale[i])
                      for i, p in enumerate(parameters)} | {'shared': s.shared} for s in sources}
 

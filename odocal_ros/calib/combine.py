@@ -65,11 +65,8 @@ def combine_method(name: str, results: Sequence[MethodResult],
 
 def last_leg_values(results: Sequence[MethodResult],
                     combined: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """
-    Return values that apply to single legs, such as gyro biases, from the last leg with a value.
-
-    combined : values that are left out, as they apply to all legs.
-    """
+    """Return values of single legs, such as gyro biases, from the last leg that has them."""
+    # combined : values of all legs together, which are left out
     values: dict[str, Estimate] = {}
     for name, e in (item for r in results for item in r.estimates.items()):
         if name not in combined and name != 'scale_ratio' and (

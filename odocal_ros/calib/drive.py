@@ -44,11 +44,8 @@ def check_drive(track: Track, t_stop: float, metres_per_unit: float,
 
 def check_path_and_speed(track: Track, t_stop: float, metres_per_unit: float,
                          leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
-    """
-    Return the path length between the marks, m, and reasons if it or the speed is too low.
-
-    t_stop : stop mark, s.   metres_per_unit : approximate scale.   leg : limits.
-    """
+    """Return the path length between the marks, m, and reasons if it or the speed is too low."""
+    # t_stop : stop mark, s.   metres_per_unit : approximate scale.   leg : limits
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
     distance = float(np.abs(np.diff(s)).sum())

@@ -178,13 +178,8 @@ def _combine_method(name: str, legs: Sequence[_LegMethod], config: Config,
 
 def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
                  overlapping: Sequence[LegResult], estimating_methods: Sequence[str],
-                 estimates: Mapping[str, Estimate],
-                 has_earlier: bool) -> list[Reason]:
-    """
-    Return the reasons of the legs, numbered if there are several.
-
-    has_earlier : the result includes information of earlier legs.
-    """
+                 estimates: Mapping[str, Estimate], has_earlier: bool) -> list[Reason]:
+    """Return the reasons of the legs; has_earlier: the result includes earlier legs."""
     is_single = len(legs) == 1 and not has_earlier
     reasons = []
     for number, leg in enumerate(legs, 1):

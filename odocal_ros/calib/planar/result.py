@@ -98,11 +98,8 @@ class Value(NamedTuple):
 
 def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
                        slopes: float = 0.0) -> MethodResult:
-    """
-    Return the result of a fit.
-
-    unit, nominal : of the scale factor.   slopes : relative shortening of the path by slopes.
-    """
+    """Return the result of a fit; unit, nominal: of the scale factor."""
+    # slopes : relative shortening of the path, by which the scale may be wrong
     quantities = _select_quantities(fit.names, config)
     values = _compute_values(fit, quantities, slopes)
     estimates, reasons = unknown_values(unit), _fit_reasons(fit)

@@ -112,11 +112,7 @@ def propagate(path: Path, x_0: Floats | list[float], eps_b: Floats | list[float]
 
 
 def _transitions(path: Path, radius: float | None, drift_b: Floats) -> Floats:
-    """
-    Return the transition to each epoch, (m, 6, 7): [A | B], x_1 = A x_0 + B; the first is [I | 0].
-
-    drift_b : (..., 3, 1) drift in b, rad/s.
-    """
+    """Return [A | B] to each epoch, x_1 = A x_0 + B: (m, 6, 7).   drift_b : (..., 3, 1) in b."""
     dt = np.diff(path.t)[:, None, None]
     latitude, height = ((a[:-1] + a[1:]) / 2 for a in (path.latitude, path.height))
     Fdt = coefficients(latitude, height, path.velocity_n, radius) * dt
