@@ -87,15 +87,15 @@ def _step_rotations(q_nb: Floats) -> Floats:
 
 def _noise_integral(r: Floats, dt: Floats) -> Floats:
     """Return the integral of [r x][r x]^T over time, (3, 3) m^2 s: the effect of white noise."""
-    mid = (r[:-1] + r[1:]) / 2
-    outer = np.einsum('ni,nj,n->ij', mid, mid, dt)
+    middle = (r[:-1] + r[1:]) / 2
+    outer = np.einsum('ni,nj,n->ij', middle, middle, dt)
     return np.asarray(np.trace(outer) * np.eye(3) - outer)
 
 
 def root_of(covariance: Floats) -> Floats:
     """Return a square root of a covariance that may be singular: A A^T = covariance."""
-    value, vector = np.linalg.eigh(covariance)
-    return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
+    eigenvalues, V = np.linalg.eigh(covariance)
+    return np.asarray(V * np.sqrt(np.maximum(eigenvalues, 0.0)))
 
 
 def _odometer_delay_effect(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,

@@ -57,8 +57,8 @@ def speed_scale(t_fix: Floats, fix_n: Floats, reckoned_n: Floats, distance: Floa
     odometer_travel = np.diff(travel.at(t))
     speed = travel.at(t + 0.5) - travel.at(t - 0.5)       # mean of 1 s about each knot
     is_straight = reckoned > 0.8 * path      # judgement: in tighter turns a chord is too short
-    fine = travel.at(t[:-1, None] + duration[:, None] * np.arange(0.0, 1.0, 0.1))
-    step = np.diff(fine, axis=1)
+    # travel in each tenth of a cell
+    step = np.diff(travel.at(t[:-1, None] + duration[:, None] * np.arange(0.0, 1.0, 0.1)), axis=1)
     same_direction = (step > 0).all(axis=1) | (step < 0).all(axis=1)
     has_no_gap = 2 * cell > duration
     usable = has_no_gap & is_straight & (odometer_travel != 0) & same_direction

@@ -43,7 +43,7 @@ class LegSearch:
 
     def __init__(self, config: Config) -> None:
         self._steps: StepReader | None = None
-        self._rest_travel = 0.0      # odometer units, travel that is no motion
+        self._rest_travel = 0.0      # odometer units, largest travel that is no motion
         self._standstill_ns = round(config.leg.standstill * 1e9)
         self._rest_ns = max(LEG_END_REST_NS, self._standstill_ns)
         self._longest_ns = round(config.leg.automatic_minutes * 60e9)

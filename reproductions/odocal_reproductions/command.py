@@ -11,7 +11,7 @@ from odocal_ros.errors import BadUsage
 
 def add_outputs(parser: argparse.ArgumentParser, picture: str) -> None:
     """Declare --json and --plot; picture: what it shows."""
-    parser.add_argument('--json', action='store_true', help='print one JSON object instead')
+    parser.add_argument('--json', action='store_true', help='print JSON instead of text')
     parser.add_argument('--plot', metavar='FILE', help=f'draw {picture}: .png, .svg or .pdf')
 
 

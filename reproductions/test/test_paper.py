@@ -40,6 +40,7 @@ EXPECTED_YAW_DEG = {
     'eps_z': (8.40e-4, 0.01e-4), 'phi_E0': (-1.379e-4, 0.001e-4), 'phi_N0': (0.06e-5, 0.01e-5),
     'phi_U0': (-0.05998, 0.00001), 'all': (-0.05929, 0.00001)}
 TILTED = ('phi_E0', 'phi_N0', 'all')
+SECOND_ORDER_DEG = np.rad2deg(np.deg2rad(0.5 / 60)**2 / 2)      # phi^2 / 2 of a tilt
 
 
 @pytest.fixture(scope='module')
@@ -106,7 +107,7 @@ def test_table_3_is_the_expected_column_minus_its_row_none(tables, source):
     yaw_deg, unit = EXPECTED_YAW_DEG[source]
     # half a unit of the last digits. The column was solved in the plane, the pipeline solves in
     # space: tilts along and across the track differ between the two by their product, phi^2 / 2
-    second_order = np.rad2deg(np.deg2rad(0.5 / 60)**2 / 2) if source in TILTED else 0
+    second_order = SECOND_ORDER_DEG if source in TILTED else 0
     expected = yaw_deg - EXPECTED_YAW_DEG['none'][0]
     if source == 'none':
         # by the resolution of the pulses: 1e-6 m over 11 200 m
@@ -176,7 +177,7 @@ def test_the_plane_of_the_paper_gives_the_expected_column(source):
     b_dr = prepared.origin.to_geodetic(prepared.origin.to_n(o) + K0 * M @ forward_b(0.0, 0.0))
     K, alpha = by_chords(o, b, b_dr, K0, np.deg2rad(116.0))
     yaw_deg, unit = EXPECTED_YAW_DEG[source]
-    second_order = np.rad2deg(np.deg2rad(0.5 / 60)**2 / 2) if source in TILTED else 0
+    second_order = SECOND_ORDER_DEG if source in TILTED else 0
     assert np.rad2deg(alpha - truth.yaw) == pytest.approx(yaw_deg, abs=unit / 2 + second_order)
     # the plane at 8 and at 9.5 km from its meridian: 1.2e-7; a tilt of 1.5e-4 in the level, which
     # rotates by 1.8e-3 over the track: 1.3e-7

@@ -21,7 +21,7 @@ from odocal_reproductions.patent.embodiment import (
     PRINTED,
     PRINTED_BEST,
 )
-from odocal_ros.calib.wheel_search.parameter_sets import bose, full_factorial
+from odocal_ros.calib.wheel_search.parameter_sets import bose_array, full_factorial
 from odocal_ros.offline.cli import main
 
 pytestmark = pytest.mark.core
@@ -90,7 +90,7 @@ def test_the_embodiment_gives_the_printed_values():
 
 
 def test_one_wrong_cell_makes_an_array_unbalanced():
-    array = bose(5, 6)
+    array = bose_array(5, 6)
     assert imbalance(array, (5,) * 6) == 0.0
     array[7, 2] = (array[7, 2] + 1) % 5
     assert imbalance(array, (5,) * 6) == 1.0

@@ -193,9 +193,9 @@ def test_arrays_exist_for_prime_powers_only():
     assert [parameter_sets.next_prime_power(n, odd=True) for n in (3, 4, 8, 14, 26, 50)] == [
         3, 5, 9, 17, 27, 53]
     with pytest.raises(BadUsage, match='6 levels'):
-        parameter_sets.bose(6, 3)
+        parameter_sets.bose_array(6, 3)
     with pytest.raises(BadUsage, match='5 columns'):
-        parameter_sets.bose(3, 5)
+        parameter_sets.bose_array(3, 5)
     with pytest.raises(BadUsage, match='0 levels'):
         parameter_sets.design_for(0)
 
@@ -204,13 +204,14 @@ def test_arrays_exist_for_prime_powers_only():
 @pytest.mark.core
 @pytest.mark.parametrize('q', [*PRIME_POWERS, 25, 27, 49])
 def test_every_array_is_balanced(q):
-    array = parameter_sets.bose(q, q + 1)
+    array = parameter_sets.bose_array(q, q + 1)
     assert array.shape == (q * q, q + 1)
     assert balanced(array)
     array[3, 1] = (array[3, 1] + 1) % q     # one wrong cell is found
     assert not balanced(array)
     # three of each level in each column: L9(3^4) of figure 2 of the patent, in another order
-    assert all((np.bincount(column) == q).all() for column in parameter_sets.bose(q, q + 1).T)
+    columns = parameter_sets.bose_array(q, q + 1).T
+    assert all((np.bincount(column) == q).all() for column in columns)
 
 
 @pytest.mark.parametrize(('levels', 'rows'), [(1, 1), (2, 8), (3, 9), (4, 16), (7, 49), (9, 81)])

@@ -19,8 +19,8 @@ from odocal_ros.data.arrays import Complexes, Floats, Ints, running_sum
 # track widths, m, 7.5 % apart, and right over left wheel minus 1. Judgement: of robots
 WIDTHS = np.geomspace(0.05, 3.0, 58)
 RATIOS = np.linspace(-0.03, 0.03, 13)
-MAX_MINIMA, SAME_COST = 5, 1.3     # judgement: minima compared, and ratio of equivalent costs
-SWAPPED = 0.3     # judgement: cost by mirrored positions over cost, if the wheels are swapped
+MAX_MINIMA, EQUIVALENT_COSTS = 5, 1.3     # judgement: minima compared, ratio of equal costs
+SWAPPED_COST_RATIO = 0.3     # judgement: of mirrored to given positions, if wheels are swapped
 # m, wheel path over which dead reckoning is compared. Judgement: several moves and turns
 WINDOW = 6.0
 # judgement: steps in a window between distant positions, such as marks; two fit any path
@@ -69,7 +69,8 @@ def first_values(run: Run, width: float) -> FirstValues:
         minimum = minimize(cost, guess, method='Nelder-Mead', options={
             'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]], 'maxfev': 80})
         refined.append((minimum.fun, minimum.x))
-    limit = SAME_COST * min(value for value, _ in refined) + len(position) * 1e-6   # (1 mm)^2 each
+    # (1 mm)^2 for each position
+    limit = EQUIVALENT_COSTS * min(value for value, _ in refined) + len(position) * 1e-6
     expected = np.log(width or WIDTHS[-1])
     x = min((x for value, x in refined if value <= limit), key=lambda x: abs(x[0] - expected))
     _, (factor,), (turn,) = alignment.fit(x[0], x[1:])
@@ -78,7 +79,7 @@ def first_values(run: Run, width: float) -> FirstValues:
     scale = float(np.median(np.abs(factor)))
     return FirstValues(scale * (1 - x[1] / 2), scale * (1 + x[1] / 2),
                        float(np.exp(x[0])) * scale / scale_guess, heading,
-                       bool(mirrored.min() < SWAPPED * costs.min()))
+                       bool(mirrored.min() < SWAPPED_COST_RATIO * costs.min()))
 
 
 def _scale_guess(position: Complexes, path: Floats) -> float:

@@ -26,7 +26,9 @@ ARC = 0.75      # definition: ``Wheels.straightness`` on a radius of twice the t
 # change from turns on the spot to that radius. Judgement, measured: docs/decisions/0024
 WIDTH_LAW_SHARE, ARC_SIGMA_LIMIT = 0.15, 0.05
 LAW_SOURCE, FIT_SOURCE, SLOPES = 'width_by_radius', 'positions_and_wheel_noise', 'slopes'
-WHEEL_NOISE, NOISE_LIMIT = ('along', 'turn', 'spin'), 0.1     # m/sqrt(m), judgement: of slip
+NOISE_LIMIT = 0.1     # m/sqrt(m), judgement: of slip
+# definition: levels of ``fit.LEVELS`` that are wheel noise, and their names in texts
+WHEEL_NOISE = {'along': 'along the path', 'turn': 'in turns', 'spin': 'in turns on the spot'}
 REQUIRED_TURNS = ('turns on the spot in both directions, each followed by a straight of a metre '
                   'or more')
 Constants = dict[str, float]
@@ -177,7 +179,7 @@ def _fit_reasons(fit: Fit) -> list[Reason]:
     if fit.levels[noisy] > NOISE_LIMIT:
         reasons.append(Reason(
             Code.NOT_CONVERGED, f'wheels and positions differ by {1e3 * fit.levels[noisy]:.0f} mm '
-            f'in a metre of travel ({noisy}); the limit is {1e3 * NOISE_LIMIT:.0f} mm',
+            f'in a metre {WHEEL_NOISE[noisy]}; the limit is {1e3 * NOISE_LIMIT:.0f} mm',
             'Check the order of odometer.wheels, odometer.drive, odometer.time_offset and '
             'gnss.time_offset.'))
     return reasons

@@ -80,7 +80,7 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
     return add, (products[..., :m] % p) @ weight
 
 
-def bose(q: int, columns: int) -> Ints:
+def bose_array(q: int, columns: int) -> Ints:
     """
     Return Bose's orthogonal array L(q^2)(q^columns): (q^2, columns) level numbers.
 
@@ -109,7 +109,7 @@ def design_for(levels: int) -> tuple[str, Ints]:
         raise BadUsage(f'{levels} levels: give 1 or more for each parameter')
     if levels < 3:
         return f'all {levels**3} combinations', full_factorial((levels,) * 3)
-    return f'L{levels**2}({levels}^{levels + 1})', bose(levels, 3)
+    return f'L{levels**2}({levels}^{levels + 1})', bose_array(levels, 3)
 
 
 @dataclass(frozen=True, eq=False)

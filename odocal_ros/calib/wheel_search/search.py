@@ -188,8 +188,10 @@ def _convergence_reasons(ranges: Ranges, surface: minimisation.SurfaceMinimum,
     share = float((difference / ranges.half_range).max())
     max_share = 1e-3    # of the range
     if share > max_share or not squares.converged:
-        reasons.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
-                              f'differ by {100 * share:.2g} % of the range'))
+        text = 'least squares have not converged' if not squares.converged else (
+            f'response surface and least squares differ by {100 * share:.2g} % of the search '
+            f'range; the limit is {100 * max_share:g} %')
+        reasons.append(Reason(Code.SEARCH_NOT_SETTLED, text))
     return reasons
 
 

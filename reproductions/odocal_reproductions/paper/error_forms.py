@@ -58,26 +58,18 @@ class SpeedProfile:
         """Return the distance-weighted mean of (m,) values, linear between epochs."""
         return float(self._weight @ (x[1:] + x[:-1]) / 2)
 
-    def mean_square(self, x: Floats) -> float:
-        """Return the distance-weighted mean of the square."""
-        a, b = x[:-1], x[1:]
-        return float(self._weight @ (a * a + a * b + b * b) / 3)
-
     def variance(self, x: Floats) -> float:
         """Return the distance-weighted variance."""
-        return self.mean_square(x - self.mean(x))
+        a, b = x[:-1] - self.mean(x), x[1:] - self.mean(x)
+        return float(self._weight @ (a * a + a * b + b * b) / 3)
 
-    def mounting_error(self, phi_U: Floats, tilt: Floats | None = None) -> tuple[float, float]:
+    def mounting_error(self, phi_U: Floats) -> tuple[float, float]:
         """
         Return dalpha (rad) and dK / K of a straight leg of this profile: (29)-(33) generalised.
 
-        phi_U : (m,) heading error at the epochs, rad; dalpha is minus its mean.
-        tilt : (m,) error or unmodelled pitch of the track, rad: in a plane it shortens the track.
-
-        To second order; a constant heading error changes no length.
+        phi_U : (m,) heading error at the epochs, rad.   To second order.
         """
-        variance = self.variance(phi_U) + (0.0 if tilt is None else self.mean_square(tilt))
-        return -self.mean(phi_U), variance / 2
+        return -self.mean(phi_U), self.variance(phi_U) / 2
 
     def heading_and_drift(self, phi_U0: float, eps_z: float) -> tuple[float, float]:
         """Return dalpha (rad) and dK / K of an initial heading error, rad, and a drift, rad/s."""

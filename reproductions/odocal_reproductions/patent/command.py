@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument('--fix-noise', default='white', choices=FIXES,
                         help='errors of the simulated fixes (default white, 1.5 m)')
-    parser.add_argument('--seed', type=int, default=1, help='of the simulated drive (default 1)')
+    parser.add_argument('--seed', type=int, default=1, help='random seed of the drive (default 1)')
     add_outputs(parser, 'the distances of all combinations and of each line')
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.wheel_search import minimisation
 from odocal_ros.calib.wheel_search.parameter_sets import (
-    bose,
+    bose_array,
     full_factorial,
     next_prime_power,
     parameter_sets,
@@ -111,7 +111,7 @@ def nearly_balanced(levels: tuple[int, ...]) -> Ints:
     twice, evenly around the middle. Each pair of levels still occurs.
     """
     q = next_prime_power(max(*levels, len(levels) - 1))
-    rows = bose(q, len(levels))
+    rows = bose_array(q, len(levels))
     for column, n in enumerate(levels):
         fold = np.rint((np.arange(q) + 0.5) * n / q - 0.5).astype(np.int64)
         rows[:, column] = np.clip(fold, 0, n - 1)[rows[:, column]]
