@@ -17,7 +17,7 @@ import numpy as np
 
 from odocal_ros.calib.drive import separated_fixes
 from odocal_ros.calib.reversals import PLAUSIBLE_RATIO
-from odocal_ros.data.arrays import Floats, map_rows
+from odocal_ros.data.arrays import Floats, Ints, map_rows
 from odocal_ros.nav.geodesy import MIN_GNSS_MOTION
 from odocal_ros.nav.rotations import arctan2
 from odocal_ros.nav.time_series import double_integral_at, gaps_longer, integral_at
@@ -226,16 +226,25 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     # at a sudden U-turn of the course the vehicle may have reversed, and the turn in a gap of the
     # IMU is unknown: a free step of the yaw is fitted there
     restarts = np.flatnonzero((np.abs(np.diff(course)) > 2.0) | (np.diff(ended[1:][keep]) > 0))
-    drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > restarts])
-    course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
+    section = np.searchsorted(restarts, np.arange(len(t)))
+    course, gyro = (_without_drift(x, t, section) for x in (course, gyro))
     power = float(gyro @ gyro)
     # rad^2: turns of 1 rad in total, root sum of squares, plus the error of chords at U-turns
     if course @ course < 1.0 + U_TURN_ERROR * len(restarts) or power == 0:
         return None
     slope = float(course @ gyro / power)      # of the noisy course on the clean gyro: no bias
     explained = slope**2 * power / (course @ course)      # share of the course's variance
-    is_certain = explained * (len(t) - 1 - drift.shape[1]) > SLOPE_SIGMAS**2 * (1 - explained)
+    freedom = len(t) - 3 - len(restarts)      # slope, drift and a constant of each section
+    is_certain = explained * freedom > SLOPE_SIGMAS**2 * (1 - explained)
     return 1 / slope if explained > MIN_CORRELATION**2 and is_certain else None
+
+
+def _without_drift(x: Floats, t: Floats, section: Ints) -> Floats:
+    """Return x minus the best constant of each section and a common drift: all (n,)."""
+    # not by lstsq: two receivers on one topic have a section for each fix
+    count = np.bincount(section)
+    x, t = (column - (np.bincount(section, column) / count)[section] for column in (x, t))
+    return x - t * (x @ t / max(float(t @ t), 1e-300))
 
 
 def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:

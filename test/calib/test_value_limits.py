@@ -3,11 +3,13 @@
 
 """Limits of values, of the track against the fixes, and of the units and axes of an IMU."""
 
+import time
+
 import numpy as np
 import pytest
 
 from odocal_ros.calib.drive import separated_fixes
-from odocal_ros.calib.gyro_axes import gyro_reasons, turn_ratio
+from odocal_ros.calib.gyro_axes import _without_drift, gyro_reasons, turn_ratio
 from odocal_ros.calib.marks import slow_variance
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.track_check import (
@@ -245,6 +247,27 @@ def test_reversing_vehicle_does_not_turn_more_than_its_gyro_measures():
         fixes = np.cumsum(step, axis=0)[::5]
         ratio = turn_ratio(t, np.gradient(faces, t), t[::5], fixes, 1.5)
         assert gyro_reasons(ratio, 1.0) == ()
+
+
+def test_alternating_receivers_take_no_longer_than_one():
+    """Fixes of two antennas 20 m apart: the course changes by half a turn at each fix."""
+    t = np.arange(0.0, 300.0, 0.1)
+    yaw = np.cumsum(0.2 * np.sin(t / 20)) * 0.1
+    fixes = np.cumsum(np.stack([np.cos(yaw), np.sin(yaw)], -1), axis=0)[::2]     # 10 m/s
+    fixes[1::2, 1] += 20.0
+    begin = time.process_time()
+    assert turn_ratio(t, np.gradient(yaw, t), t[::2], fixes, 0.5) is None
+    assert time.process_time() - begin < 1.0      # takes 5 ms; by a solution of all sections, 10 s
+
+
+@pytest.mark.parametrize('sections', [1, 8, 150])
+def test_drift_of_sections_is_that_of_a_fit(sections):
+    rng = np.random.default_rng(2)
+    t, x = np.cumsum(rng.random(300)), np.cumsum(rng.normal(size=300))
+    section = np.sort(np.r_[np.arange(sections), rng.integers(sections, size=300 - sections)])
+    columns = np.column_stack([t, section[:, None] == np.arange(sections)])
+    expected = x - columns @ np.linalg.lstsq(columns, x, rcond=None)[0]
+    np.testing.assert_allclose(_without_drift(x, t, section), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize('row', [24.0, 25.0, 26.5, 28.0])
