@@ -115,7 +115,7 @@ def _starts(simulated, seed, grade, noise, worst):
     change = [(math.log(late.estimates[NAMES[0]].value) - best.state.constants[0]),
               *(late.estimates[n].value - best.state.constants[i]
                 for i, n in enumerate(NAMES) if i)]
-    sigma = np.sqrt(np.diag(best.solved.covariance))[:3]
+    sigma = np.sqrt(np.diag(best.solution.covariance))[:3]
     _keep(worst, f'starts in motion: nothing or truth, {grade} {noise}', np.array(change) / sigma)
     # the rest of the drive adds to it: the difference of both is what the rest is worth
     # (levels differ from fit to fit, so that a difference of equals may be below zero)

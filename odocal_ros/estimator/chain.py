@@ -32,7 +32,7 @@ class NotPositive(OdocalError):
         self.block = block
 
 
-class Normal:
+class NormalEquations:
     """
     Normal equations H x = g of N blocks of n unknowns and of m constants, initially zero.
 
@@ -53,7 +53,7 @@ class Normal:
 
 
 @dataclass(eq=False)
-class Solved:
+class Solution:
     """The solution, and the elimination from which the covariances are computed."""
 
     step: Floats              # (N, n) of the blocks
@@ -210,7 +210,7 @@ class JointMarginals:
             yield self.covariances(np.arange(rows.start, rows.stop))
 
 
-def solve(normal: Normal) -> Solved:
+def solve(normal: NormalEquations) -> Solution:
     """Solve normal equations in place; raises NotPositive if an unknown is not constrained."""
     right_sides, (N, n), m = normal.right_sides, normal.g.shape, len(normal.g_constants)
     s, s_c = _scale(normal)
@@ -231,14 +231,14 @@ def solve(normal: Normal) -> Solved:
     for k in iterate_releasing(range(N - 2, -1, -1)):
         x[k] -= right_sides[k][:, :n] @ x[k + 1]
     unused = normal.unused_weights
-    return Solved(
+    return Solution(
         x * s, _with_unused(c * s_c, 0 * unused),
         _with_unused(covariance * s_corner, 1 / unused), float(logdet),
         _with_unused(reduced, unused), _with_unused(corner[:m, m] / s_c, 0 * unused),
         (right_sides, normal.diagonal), s, s_c)
 
 
-def _scale(normal: Normal) -> tuple[Floats, Floats]:
+def _scale(normal: NormalEquations) -> tuple[Floats, Floats]:
     """Scale the blocks to a unit diagonal, in place; return the factors: (N, n), (m,)."""
     diagonal, right_sides = normal.diagonal, normal.right_sides
     N, n = normal.g.shape
@@ -255,7 +255,7 @@ def _scale(normal: Normal) -> tuple[Floats, Floats]:
     return s[:N], s_c
 
 
-def _eliminate(normal: Normal, corner: Floats) -> Floats:
+def _eliminate(normal: NormalEquations, corner: Floats) -> Floats:
     """
     Eliminate the blocks, in place; return the diagonals of their Cholesky factors: (N, n).
 

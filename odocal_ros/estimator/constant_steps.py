@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.data.arrays import blocks, Floats, Ints, runs, work_array
-from odocal_ros.estimator.chain import Solved
-from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator.chain import Solution
+from odocal_ros.estimator.equations import WeightedEquations
 from odocal_ros.estimator.factors.factor import IMU
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.state import LN_K, PHI, PITCH, YAW
@@ -48,12 +48,13 @@ class ConstantStep:
         return abs(self.size) > FAULT_SIGMAS * self.sigma
 
 
-def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantStep, ...]:
-    """Return the most significant step of each constant; call before ``solved.marginals``."""
+def find_constant_steps(weighted: WeightedEquations,
+                        solution: Solution) -> tuple[ConstantStep, ...]:
+    """Return the most significant step of each constant; call before ``solution.marginals``."""
     rows = weighted[MotionRows]
     path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
     first = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
-    score, matrix, upper_limit = _scores(rows, solved, first)
+    score, matrix, upper_limit = _scores(rows, solution, first)
     information = np.diag(matrix).copy()
     scale = slice(STEP_PLACES)
     score[scale], information[scale] = _with_gradual_change(score[scale], matrix[scale, scale])
@@ -72,7 +73,7 @@ def find_constant_steps(weighted: Weighted, solved: Solved) -> tuple[ConstantSte
                  else step for step in steps)
 
 
-def _turn_of_imu(weighted: Weighted) -> ConstantStep | None:
+def _turn_of_imu(weighted: WeightedEquations) -> ConstantStep | None:
     """Return the largest turn that only the gyro measured as a step of the yaw, None without."""
     # the IMU turned on the vehicle; the fit may keep the yaw, and call the gyro an outlier
     rows = weighted[MotionRows]
@@ -86,7 +87,7 @@ def _turn_of_imu(weighted: Weighted) -> ConstantStep | None:
     return ConstantStep(YAW, float(weighted.state.t[begin]), -size, float(sigma))
 
 
-def _scores(rows: MotionRows, solved: Solved, first: Ints) -> tuple[Floats, Floats, Floats]:
+def _scores(rows: MotionRows, solution: Solution, first: Ints) -> tuple[Floats, Floats, Floats]:
     """
     Return the scores of L steps, (L,), their information, (L, L), and its upper limit, (L,).
 
@@ -107,10 +108,10 @@ def _scores(rows: MotionRows, solved: Solved, first: Ints) -> tuple[Floats, Floa
         products += (np.swapaxes(C, 1, 2) @ C).sum(axis=0)
         score -= np.einsum('kil,ki->l', C, rows.r[chunk])
     # a shortened step of the fit ends before the minimum of the equations: move the scores to it
-    to_minimum = 1 / solved.step_fraction - 1
-    score -= to_minimum * (np.einsum('kil,ki->l', g, solved.step)
-                           + g_constants.T @ solved.step_constants[:len(g_constants)])
-    return score, products - solved.quadratic_forms(g, g_constants)[0], np.diag(products)
+    to_minimum = 1 / solution.step_fraction - 1
+    score -= to_minimum * (np.einsum('kil,ki->l', g, solution.step)
+                           + g_constants.T @ solution.step_constants[:len(g_constants)])
+    return score, products - solution.quadratic_forms(g, g_constants)[0], np.diag(products)
 
 
 def _with_gradual_change(score: Floats, information: Floats) -> tuple[Floats, Floats]:

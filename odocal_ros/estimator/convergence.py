@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.chain import Solved
+from odocal_ros.estimator.chain import Solution
 from odocal_ros.estimator.factors.factor import PARAMETER_COUNT
 
 
@@ -62,10 +62,10 @@ class Progress:
         self.largest_step = np.inf      # weighted, of all constants, in sigmas
         self.previous_step = np.zeros(layout.M)     # of the constants, for ``damp_step``
 
-    def update(self, count: int, solved: Solved) -> None:
+    def update(self, count: int, solution: Solution) -> None:
         """Update the state of convergence from the steps and sigmas of pass ``count``."""
-        sigma = np.sqrt(np.diag(solved.covariance))
-        step = np.abs(solved.step_constants / sigma)
+        sigma = np.sqrt(np.diag(solution.covariance))
+        step = np.abs(solution.step_constants / sigma)
         self.largest_step = float((step * np.where(sigma < FLAT_SIGMAS, STEP_WEIGHTS, 0.0)).max())
         before, self.sigma, last_change = self.sigma, sigma[:PARAMETER_COUNT], self.change
         self.change = np.abs(np.log(self.sigma / before)).max()
@@ -80,4 +80,4 @@ class Progress:
         # a first step with the fitted signal is never shortened: it corrects the error that noise
         # in the measured signal caused
         next_is_first = self.fitted and not self.was_fitted
-        self.previous_step = np.zeros(layout.M) if next_is_first else solved.step_constants
+        self.previous_step = np.zeros(layout.M) if next_is_first else solution.step_constants

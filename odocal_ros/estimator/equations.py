@@ -4,9 +4,9 @@
 """
 The least-squares problem of a leg, linearised at one state.
 
-``Equations`` has the factors (sensors and priors) at the state. ``Weighted`` has them at given
-noise levels, and returns the sums over all factors: normal equations, cost, variance components.
-An additional sensor or prior is one more class in ``FACTORS``.
+``Equations`` has the factors (sensors and priors) at the state. ``WeightedEquations`` has them at
+given noise levels, and returns the sums over all factors: normal equations, cost, variance
+components. An additional sensor or prior is one more class in ``FACTORS``.
 """
 
 from typing import TypeVar
@@ -14,7 +14,8 @@ from typing import TypeVar
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.chain import JointMarginals, Normal, NotPositive, solve, Solved
+from odocal_ros.estimator import chain
+from odocal_ros.estimator.chain import JointMarginals, NormalEquations, Solution
 from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
 from odocal_ros.estimator.factors.gnss import Fixes, VelocityRows
 from odocal_ros.estimator.factors.heading import HeadingRows
@@ -66,7 +67,7 @@ class Equations:
                         if kind.is_present(problem)}
 
 
-class Weighted:
+class WeightedEquations:
     """The factors at given levels: equations of a step, and cost and components at the state."""
 
     def __init__(self, equations: Equations, levels: Levels) -> None:
@@ -80,34 +81,34 @@ class Weighted:
         """Return the factor of a class."""
         return next(factor for factor in self.factors.values() if isinstance(factor, kind))
 
-    def normal(self) -> Normal:
+    def normal(self) -> NormalEquations:
         """Return the normal equations of the step."""
-        out = Normal(len(self.state.t), self.n, self.m)
+        out = NormalEquations(len(self.state.t), self.n, self.m)
         for factor in self.factors.values():
             factor.add(out)
         return out
 
-    def solved(self) -> Solved:
+    def solve(self) -> Solution:
         """Return the solution; raises NotPositive if the data do not determine the unknowns."""
         try:
-            return solve(self.normal())
-        except NotPositive as error:
+            return chain.solve(self.normal())
+        except chain.NotPositive as error:
             if error.block < 0:
                 raise
-            raise NotPositive('the data do not determine the motion at t = '
-                              f'{self.state.t[error.block]:.1f} s') from None
+            raise chain.NotPositive('the data do not determine the motion at t = '
+                                    f'{self.state.t[error.block]:.1f} s') from None
 
-    def apply_step(self, solved: Solved) -> 'Weighted':
+    def apply_step(self, solution: Solution) -> 'WeightedEquations':
         """Move residuals, cost and components to the state after the step, to first order."""
-        step, constants = solved.step, solved.step_constants
+        step, constants = solution.step, solution.step_constants
         new_state = self.state.updated(step, constants)
         for factor in self.factors.values():
             factor.apply_step(step, constants, new_state)
         return self
 
-    def information(self, solved: Solved) -> LevelInformation:
+    def information(self, solution: Solution) -> LevelInformation:
         """
-        Return the information on the levels, (S27b); call before ``solved.marginals``.
+        Return the information on the levels, (S27b); call before ``solution.marginals``.
 
         The sizes of imperfections come last: their errors are those independent of the noises.
         """
@@ -115,7 +116,7 @@ class Weighted:
         sides = LevelRightHandSides(len(self.state.t), self.n, self.m, (*noises, *SIZES))
         for factor in self.factors.values():
             factor.add_levels(sides)
-        fitted, derivatives = solved.quadratic_forms(sides.g, sides.g_constants)
+        fitted, derivatives = solution.quadratic_forms(sides.g, sides.g_constants)
         return LevelInformation(sides.names, (sides.q_products - fitted) / 2, derivatives)
 
     def cost(self) -> float:

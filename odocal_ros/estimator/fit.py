@@ -17,10 +17,10 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.chain import JointMarginals, Solved
+from odocal_ros.estimator.chain import JointMarginals, Solution
 from odocal_ros.estimator.constant_steps import ConstantStep, find_constant_steps
 from odocal_ros.estimator.convergence import CONVERGENCE, Progress
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import Equations, WeightedEquations
 from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.interval_noise import INTERVAL
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -33,7 +33,7 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import Priors, State
 
 # called after each pass; the last argument is the largest step of a constant, in sigmas
-Trace = Callable[[int, State, Levels, Weighted, Solved, float], None]
+Trace = Callable[[int, State, Levels, WeightedEquations, Solution, float], None]
 # sigmas of a prior beyond which it is relaxed. Statistical: one sound prior in 22
 RELAXATION_SIGMAS = 2.0
 # step along the previous one, as a share of it, below which it is shortened. Judgement: smaller
@@ -71,15 +71,15 @@ class FitSummary:
 class Fit(FitSummary):
     """The result of a fit, with the equations of its last pass."""
 
-    weighted: Weighted
-    solved: Solved
+    weighted: WeightedEquations
+    solution: Solution
     by_levels: Floats        # (M, L) effects of unit errors of the levels on the constants, (S27b)
     constant_steps: tuple[ConstantStep, ...] = ()     # of scale, yaw, pitch within the leg, (S27c)
 
     @property
     def covariance(self) -> Floats:
         """Return the covariance of the constants, with the errors of the levels: (M, M)."""
-        return self.solved.covariance + self.by_levels @ self.by_levels.T
+        return self.solution.covariance + self.by_levels @ self.by_levels.T
 
     def summary(self) -> FitSummary:
         """Return everything but the equations, so that their memory can be released."""
@@ -110,14 +110,14 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
     count, state = 0, state.with_mean_up()
     while True:
         count += 1
-        weighted = Weighted(
+        weighted = WeightedEquations(
             Equations(problem, state, priors, variance_factors, progress.fitted), levels)
-        solved = damp_step(weighted.solved(), progress.previous_step)
-        progress.update(count, solved)
-        state = state.updated(solved.step, solved.step_constants).with_mean_up()
-        weighted.apply_step(solved)
+        solution = damp_step(weighted.solve(), progress.previous_step)
+        progress.update(count, solution)
+        state = state.updated(solution.step, solution.step_constants).with_mean_up()
+        weighted.apply_step(solution)
         if trace is not None:
-            trace(count, state, levels, weighted, solved, progress.largest_step)
+            trace(count, state, levels, weighted, solution, progress.largest_step)
         if progress.converged or count >= max_iterations:
             break
         if count == outlier_passes.start and not has_sample_sizes:
@@ -126,25 +126,25 @@ def fit(problem: Problem, state: State, levels: Levels, max_iterations: int = 40
                 name: rows_per_independent(rows) for name, rows in weighted.factors.items()
                 if name in (*problem.external, SpeedSteps.name) and isinstance(rows, PointRows)}
         if not frozen:
-            marginals = solved.marginals()
+            marginals = solution.marginals()
             levels = level_steps.update(weighted, marginals, progress.was_fitted)
             if count in outlier_passes:
                 variance_factors = update_variance_factors(weighted, marginals, variance_factors,
                                                            levels)
-                priors = relax_priors(initial_priors, priors, state, solved, marginals)
+                priors = relax_priors(initial_priors, priors, state, solution, marginals)
             del marginals
-        del weighted, solved      # before the next ones: the largest memory of a long leg
+        del weighted, solution      # before the next ones: the largest memory of a long leg
     converged = progress.converged or bool(progress.largest_change < CONVERGENCE.max_final_step)
     slowly_converging = not converged and bool(progress.largest_change < CONVERGENCE.max_slow_step)
-    likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
-    by_levels = weighted.information(solved).effects(prior_information(levels))
+    likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solution.log_determinant)
+    by_levels = weighted.information(solution).effects(prior_information(levels))
     return Fit(state, levels, priors, initial_priors, variance_factors,
                converged or slowly_converging, slowly_converging, count, likelihood,
-               weighted=weighted, solved=solved, by_levels=by_levels,
-               constant_steps=find_constant_steps(weighted, solved))
+               weighted=weighted, solution=solution, by_levels=by_levels,
+               constant_steps=find_constant_steps(weighted, solution))
 
 
-def damp_step(solved: Solved, previous_step: Floats) -> Solved:
+def damp_step(solution: Solution, previous_step: Floats) -> Solution:
     """
     Return the step, shortened if it reverses the previous step, docs/method.md (S27a).
 
@@ -153,15 +153,15 @@ def damp_step(solved: Solved, previous_step: Floats) -> Solved:
     Gauss-Newton omits residuals times second derivatives. They can be as large as the information
     on a constant; full steps then oscillate.
     """
-    square = float(previous_step @ solved.reduced @ previous_step)
-    product = float(previous_step @ solved.reduced @ solved.step_constants)
+    square = float(previous_step @ solution.reduced @ previous_step)
+    product = float(previous_step @ solution.reduced @ solution.step_constants)
     ratio = product / square if square > 0 else 0.0
     fraction = 1 / (1 - ratio) if ratio < REVERSAL else 1.0
-    return replace(solved, step=fraction * solved.step,
-                   step_constants=fraction * solved.step_constants, step_fraction=fraction)
+    return replace(solution, step=fraction * solution.step,
+                   step_constants=fraction * solution.step_constants, step_fraction=fraction)
 
 
-def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
+def update_variance_factors(weighted: WeightedEquations, marginals: JointMarginals,
                             variance_factors: Floats, new_levels: Levels) -> Floats:
     """
     Return the variance factors of outlier intervals: (K, VARIANCE_FACTOR_COUNT).
@@ -187,12 +187,12 @@ def update_variance_factors(weighted: Weighted, marginals: JointMarginals,
     return new_factors
 
 
-def relax_priors(initial: Priors, current: Priors, state: State, solved: Solved,
+def relax_priors(initial: Priors, current: Priors, state: State, solution: Solution,
                  marginals: JointMarginals) -> Priors:
     """Return priors with larger sigmas where the data contradict them, docs/method.md (S30)."""
     variance = np.diagonal(marginals[0])    # of the first keyframe
     sigma = _widen(initial.sigma, current.sigma, state.constants - initial.mean,
-                   np.diag(solved.covariance))
+                   np.diag(solution.covariance))
     # not relaxed: sizes of imperfections, which are levels, an offset that is within half a step,
     # and a time constant whose prior contains all receivers
     for constants in (layout.IMPERFECTIONS, layout.SPEED_OFFSET, layout.FIX_MOTION_TIME):

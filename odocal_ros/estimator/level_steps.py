@@ -15,7 +15,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals
-from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator.equations import WeightedEquations
 from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.factors.pseudo_observations import PriorRows, SIZE_SPREADS, SIZES
@@ -55,7 +55,8 @@ class LevelSteps:
         self._problem = problem
         self._last: dict[str, tuple[float, float]] = {}      # exponent and step before, by level
 
-    def update(self, weighted: Weighted, marginals: JointMarginals, fitted: bool) -> Levels:
+    def update(self, weighted: WeightedEquations, marginals: JointMarginals,
+               fitted: bool) -> Levels:
         """
         Return the levels after one step of (S27); sizes of imperfections by (S29).
 

@@ -11,7 +11,7 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.cold_start import cold_starts, Start
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import Equations, WeightedEquations
 from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.estimator.fit import Fit, fit, Trace, WARM_START_PASSES
 from odocal_ros.estimator.imu import imu_rows
@@ -73,7 +73,7 @@ def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fi
     coarse = problem.leg.travel.coarse
     if coarse is None or not coarse.truncation:
         return current
-    sigma = float(np.sqrt(current.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
+    sigma = float(np.sqrt(current.solution.covariance[SPEED_OFFSET, SPEED_OFFSET]))
     estimated = float(current.state.constants[SPEED_OFFSET])
     nearer = coarse.truncation if estimated > coarse.truncation / 2 else 0.0
     deviation, other_deviation = (
@@ -152,4 +152,4 @@ def cramer_rao_bound(leg: SmootherLeg, config: Config, truth: State, levels: Lev
     truth : values of all unknowns, at the keyframes of ``make_problem``.   levels : noise levels.
     """
     equations = Equations(make_problem(leg, config), truth, fitted=True)
-    return Weighted(equations, levels).solved().covariance
+    return WeightedEquations(equations, levels).solve().covariance

@@ -17,7 +17,7 @@ from odocal_ros.calib.choice import choose, deciding_methods, relevant_reasons
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.chain import NotPositive
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import Equations, WeightedEquations
 from odocal_ros.estimator.factors.factor import VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.factors.heading import CONFIGURED_NOISE, Heading
 from odocal_ros.estimator.fit import Fit
@@ -215,9 +215,9 @@ def planned_noise_levels(problem: Problem, sigmas: Sigmas, fixes_per_row: float 
 def fit_at_truth(problem: Problem, ideal: IdealSamples, levels: Levels) -> Fit:
     """Return the fit at the true state, without any iteration; no level is estimated."""
     state, priors = ideal.state, problem.priors
-    weighted = Weighted(Equations(problem, state, priors), levels)
+    weighted = WeightedEquations(Equations(problem, state, priors), levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, VARIANCE_FACTOR_COUNT)),
-               converged=True, weighted=weighted, solved=weighted.solved(),
+               converged=True, weighted=weighted, solution=weighted.solve(),
                by_levels=np.zeros((M, 0)))
 
 

@@ -15,10 +15,10 @@ from smoother_legs import leg_of, made, reason_texts
 from odocal_ros import read_bag
 from odocal_ros.calib.scale_variation import counter_change_reasons, Sections
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.chain import Normal, solve
+from odocal_ros.estimator.chain import NormalEquations, solve
 from odocal_ros.estimator.constant_steps import ConstantStep, find_constant_steps
 from odocal_ros.estimator.convergence import CONVERGENCE
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import Equations, WeightedEquations
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.remarks import _change_reasons, MIN_REPORTED_CHANGE
@@ -81,14 +81,14 @@ def column_of(problem, fit, constant, size):
 def test_step_size_equals_a_fit_with_one_more_constant(fitted, constant):
     problem, fit = fitted
     weighted, rows = fit.weighted, fit.weighted[MotionRows]
-    solved = solve(weighted.normal())
-    step = next(s for s in find_constant_steps(weighted, solved) if s.constant == constant)
+    solution = solve(weighted.normal())
+    step = next(s for s in find_constant_steps(weighted, solution) if s.constant == constant)
     at = int(np.searchsorted(fit.state.t, step.t))
     column = column_of(problem, fit, constant, 1e-5)
     column[:at] = 0.0
 
     plain, n, m = weighted.normal(), weighted.n, weighted.m
-    wider = Normal(len(fit.state.t), n, m + 1)
+    wider = NormalEquations(len(fit.state.t), n, m + 1)
     wider.diagonal[:], wider.upper[:] = plain.diagonal, plain.upper
     wider.coupling[:, :, :m], wider.corner[:m, :m] = plain.coupling, plain.corner
     wider.g[:], wider.g_constants[:m] = plain.g, plain.g_constants
@@ -112,12 +112,12 @@ def test_shortened_last_iteration_does_not_change_the_steps(fitted):
     equations = equations_at(problem, fit, constants)
     found = []
     for fraction in (1.0, 0.4):
-        weighted = Weighted(equations, fit.levels)
+        weighted = WeightedEquations(equations, fit.levels)
         full = solve(weighted.normal())
-        solved = replace(full, step=fraction * full.step, step_fraction=fraction,
+        solution = replace(full, step=fraction * full.step, step_fraction=fraction,
                          step_constants=fraction * full.step_constants)
         found.append([step.size
-                      for step in find_constant_steps(weighted.apply_step(solved), solved)])
+                      for step in find_constant_steps(weighted.apply_step(solution), solution)])
     sigma = [step.sigma for step in fit.constant_steps]
     # fixes in the tails are down-weighted with the full step
     np.testing.assert_allclose(*found, atol=0.1 * max(sigma))

@@ -15,9 +15,9 @@ from smoother_legs import leg_of, made, reason_texts, truth
 from odocal_ros.calib.marginal_information import MarginalInformation
 from odocal_ros.data.leg import part_of
 from odocal_ros.estimator import fit, smooth
-from odocal_ros.estimator.chain import solve, Solved
+from odocal_ros.estimator.chain import Solution, solve
 from odocal_ros.estimator.cold_start import AMBIGUOUS_HEADING, change_gyro_bias, cold_starts
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import Equations, WeightedEquations
 from odocal_ros.estimator.factors import point_rows, signals
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import damp_step
@@ -66,9 +66,9 @@ def test_first_iteration_with_fitted_signals_is_not_shortened(monkeypatch):
             passes.append((args[4], False))
             super().__init__(*args)
 
-    def damp_step(solved, taken, original=fit.damp_step):
+    def damp_step(solution, taken, original=fit.damp_step):
         passes[-1] = passes[-1][0], bool(taken.any())
-        return original(solved, taken)
+        return original(solution, taken)
     monkeypatch.setattr(fit, 'Equations', Watched)
     monkeypatch.setattr(fit, 'damp_step', damp_step)
     calibrate(drive.leg(), configured(drive))
@@ -80,7 +80,7 @@ def test_first_iteration_with_fitted_signals_is_not_shortened(monkeypatch):
 
 def step_of(border, reduced):
     """Return a solution with the values that ``damp_step`` reads."""
-    return Solved(border[None, :], border, None, 0.0, reduced, None, None, None, None)
+    return Solution(border[None, :], border, None, 0.0, reduced, None, None, None, None)
 
 
 def walked(slope, passes):
@@ -196,18 +196,18 @@ def weighted_equations():
 
         def at(**by):
             levels = fit.levels.replaced(**{n: fit.levels[n] * np.exp(x) for n, x in by.items()})
-            weighted = Weighted(equations, levels)
-            solved = solve(weighted.normal())
-            return weighted.apply_step(solved), solved
+            weighted = WeightedEquations(equations, levels)
+            solution = solve(weighted.normal())
+            return weighted.apply_step(solution), solution
 
         yield at, fit.levels
 
 
 def test_constants_by_level_equal_differences_of_solutions(weighted_equations):
     at, levels = weighted_equations
-    both, solved = at()
-    information = both.information(solved)
-    sigma = np.sqrt(np.diag(solved.covariance))
+    both, solution = at()
+    information = both.information(solution)
+    sigma = np.sqrt(np.diag(solution.covariance))
     for name in (*NAMES, 'correlation_time'):
         up, down = (at(**{name: x})[1].step_constants for x in (STEP, -STEP))
         moves = information.constants_by_level[:, information.names.index(name)]
@@ -218,8 +218,8 @@ def test_constants_by_level_equal_differences_of_solutions(weighted_equations):
 def test_average_information_is_the_curvature_of_the_cost(weighted_equations):
     """For variance s V the minimum cost has d2C/d(ln s)2 = 4 A + dC/d(ln s), mixed terms 4 A."""
     at, levels = weighted_equations
-    both, solved = at()
-    information = both.information(solved)
+    both, solution = at()
+    information = both.information(solution)
     A = information.average
     np.testing.assert_allclose(A, A.T, atol=1e-9 * A.max())
     assert np.linalg.eigvalsh(A).min() > -1e-9 * A.max()
@@ -243,11 +243,11 @@ def test_average_information_is_the_curvature_of_the_cost(weighted_equations):
 
 def test_known_levels_add_no_error_and_unknown_levels_add_their_prior(weighted_equations):
     at, levels = weighted_equations
-    both, solved = at()
-    information = both.information(solved)
+    both, solution = at()
+    information = both.information(solution)
     prior = prior_information(levels)
     sure = information.effects(dict.fromkeys(prior, 1e12))
-    assert (np.sqrt((sure**2).sum(axis=1)) < 1e-5 * np.sqrt(np.diag(solved.covariance))).all()
+    assert (np.sqrt((sure**2).sum(axis=1)) < 1e-5 * np.sqrt(np.diag(solution.covariance))).all()
     effects = information.effects(prior)
     most = sum(information.constants_by_level[:, i]**2 / prior[n]
                for i, n in enumerate(information.names))

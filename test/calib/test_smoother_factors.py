@@ -11,8 +11,8 @@ from scipy.interpolate import CubicHermiteSpline
 from smoother_legs import leg_of, made, truth, with_velocity
 
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.chain import Normal, solve
-from odocal_ros.estimator.equations import Equations, FACTORS, Weighted
+from odocal_ros.estimator.chain import NormalEquations, solve
+from odocal_ros.estimator.equations import Equations, FACTORS, WeightedEquations
 from odocal_ros.estimator.factors import motion
 from odocal_ros.estimator.factors.axle import Axle
 from odocal_ros.estimator.factors.motion import D, squared_bounce
@@ -185,7 +185,7 @@ def test_cost_after_a_step_agrees_with_the_normal_equations(moved, stepping, nam
     wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'pressure', 'steps'), 1e8)
     levels = problem.initial_levels.replaced(correlation_time=40.0, **wide)
     part = part_at(problem, state, name).weighted_copy(levels, layout.M)
-    normal = Normal(len(state.t), N, layout.M)
+    normal = NormalEquations(len(state.t), N, layout.M)
     part.add(normal)
     rng = np.random.default_rng(2)
     x, c = 1e-4 * rng.standard_normal((len(state.t), N)), 1e-4 * rng.standard_normal(layout.M)
@@ -211,8 +211,8 @@ def test_levels_of_correlated_errors_increase_the_restricted_likelihood(moved, n
     levels = problem.initial_levels.replaced(correlation_time=20.0, slow=0.01, slow_up=0.02,
                                            fix=1e4, fix_up=1e4, velocity=1.0)
 
-    weighted, solved, at = least(problem, state, levels)
-    quadratic, expected = weighted[SlowError].components(solved.marginals())[name]
+    weighted, solution, at = least(problem, state, levels)
+    quadratic, expected = weighted[SlowError].components(solution.marginals())[name]
     score = (quadratic - expected) / 2
     if name == 'correlation_time':      # the score itself, and the prior of the time
         score = quadratic - expected + np.log(20.0 / USUAL_TIME) / TIME_SPREAD**2
@@ -227,15 +227,15 @@ def least(problem, state, levels):
     Also return a function of levels: rows, step and logarithm of the restricted likelihood.
     """
     def at(levels):
-        weighted = Weighted(Equations(problem, state), levels)
-        solved = solve(weighted.normal())
-        weighted.apply_step(solved)
-        return weighted, solved, -0.5 * (weighted.cost() + weighted.log_R_total()
-                                         + solved.log_determinant)
+        weighted = WeightedEquations(Equations(problem, state), levels)
+        solution = solve(weighted.normal())
+        weighted.apply_step(solution)
+        return weighted, solution, -0.5 * (weighted.cost() + weighted.log_R_total()
+                                         + solution.log_determinant)
 
     for _ in range(3):
-        _, solved, _ = at(levels)
-        state = state.updated(solved.step, solved.step_constants)
+        _, solution, _ = at(levels)
+        state = state.updated(solution.step, solution.step_constants)
     return *at(levels)[:2], at
 
 
@@ -261,8 +261,8 @@ def test_sizes_of_observable_constants_are_the_mean_of_their_likelihood(moved, n
     problem, state = moved
     problem = sized(problem, where, prior, 1.5 * prior)
     levels = problem.initial_levels
-    weighted, solved, at = least(problem, state, levels)
-    found = weighted[PriorRows].sizes(solved.marginals())[name]
+    weighted, solution, at = least(problem, state, levels)
+    found = weighted[PriorRows].sizes(solution.marginals())[name]
     # 1.5 of the prior for each, and the log-normal prior of the size
     logs = np.log(SIZE) + np.arange(-2.5, 5.0, 0.25)
     likelihood = np.array([at(levels.replaced(**{name: float(np.exp(x))}))[2] for x in logs])
@@ -278,9 +278,9 @@ def test_size_of_a_weakly_observable_constant_keeps_its_prior(moved):
     # sigma 1e-3 by the drive, 7e-6 by the prior; a residual of 100 sigmas of the drive
     problem = sized(problem, where, 1e-5, 0.1)
     levels = problem.initial_levels
-    weighted, solved, at = least(problem, state, levels)
+    weighted, solution, at = least(problem, state, levels)
     name = 'size_squat_by_jerk'
     assert slope(at, levels, name) > 0.1         # the likelihood increases with the size
     # (7e-6 / 1e-3)^2 of that slope, 5e-5: the size stays at the mean of its log-normal prior
-    assert weighted[PriorRows].sizes(solved.marginals())[name] == pytest.approx(
+    assert weighted[PriorRows].sizes(solution.marginals())[name] == pytest.approx(
         SIZE * np.exp(SIZE_SPREADS[name]**2 / 2), rel=1e-3)

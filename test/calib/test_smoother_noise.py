@@ -12,7 +12,7 @@ import pytest
 from smoother_legs import leg_of, made, truth
 
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import Equations, WeightedEquations
 from odocal_ros.estimator.factors import signals
 from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.interval_noise import MIN_REST_NOISE, rest_noise
@@ -100,7 +100,7 @@ def scores(fitted):
     """Return the scores of the IMU errors at the truth from noise alone, in their sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
     problem, state = make_problem(leg, config), truth(drive, config, leg)
-    weighted = Weighted(Equations(problem, state, fitted=fitted), problem.initial_levels)
+    weighted = WeightedEquations(Equations(problem, state, fitted=fitted), problem.initial_levels)
     rows = weighted[MotionRows]
     J = rows.J[:, :, -rows.m:]
     score, information = np.einsum('kij,ki->j', J, rows.r), (J**2).sum(axis=(0, 1))
@@ -156,7 +156,7 @@ def test_whole_signal_counts_without_noise(road):
     drive, config, leg = made(duration=300.0, imu_grade='perfect', **road)
     problem, state = make_problem(leg, config), truth(drive, config, leg)
     raw, fitted = (rows.J[:, :, -rows.m:] for rows in (
-        Weighted(Equations(problem, state, fitted=x), problem.initial_levels)[MotionRows]
+        WeightedEquations(Equations(problem, state, fitted=x), problem.initial_levels)[MotionRows]
         for x in (False, True)))
     for i, name in enumerate(CONSTANTS[:raw.shape[2]]):
         if name in GYRO_ERRORS or name in ACCEL_ERRORS and road is BANKED:
@@ -281,7 +281,7 @@ def test_sigmas_of_the_biases_hold_over_the_whole_drive():
     for seed in range(1, 9):
         drive, config, leg, _, fit = fitted(seed=seed, duration=120.0)
         true = truth(drive, config, leg)
-        sigma = bias_sigmas(fit.solved.marginals(), 1.0)
+        sigma = bias_sigmas(fit.solution.marginals(), 1.0)
         off = np.stack([fit.state.gyro_bias - true.gyro_bias,
                         fit.state.accel_bias - true.accel_bias])
         errors_in_sigmas.append(off / sigma)

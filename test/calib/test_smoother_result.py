@@ -16,7 +16,7 @@ from smoother_legs import leg_of, made, reason_texts, smoothed, truth
 from odocal_ros.calib.budget import total_covariance
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.cold_start import cold_starts
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import Equations, WeightedEquations
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import make_problem
@@ -106,7 +106,8 @@ def test_stated_sigma_equals_the_bound_at_the_truth_and_the_sum_of_its_sources()
     problem = make_problem(leg, config)
     problem.priors.sigma[IMPERFECTIONS] = usual
     equations = Equations(problem, truth(drive, config, leg), fitted=True)
-    covariance = Weighted(equations, Levels.from_sigmas(details['noise'])).solved().covariance
+    levels = Levels.from_sigmas(details['noise'])
+    covariance = WeightedEquations(equations, levels).solve().covariance
     sigma = np.sqrt(np.diag(covariance))
     scale = method.estimates['scale_factor']
     # linearised at the estimate or at the truth: the same except for heavy tails
@@ -219,13 +220,13 @@ def test_fit_with_impossible_imu_errors_gives_no_values(monkeypatch):
 
 def test_equations_without_a_solution_report_the_time(monkeypatch):
     _, config, leg = made(duration=100.0)
-    normal = Weighted.normal
+    normal = WeightedEquations.normal
 
     def undetermined(weighted):
         out = normal(weighted)
         out.diagonal[40] *= 1e-9
         return out
-    monkeypatch.setattr(Weighted, 'normal', undetermined)
+    monkeypatch.setattr(WeightedEquations, 'normal', undetermined)
     reason, = smooth(leg, config).reasons
     assert reason.code is Code.NOT_CONVERGED
     imu = make_problem(leg, config).imu

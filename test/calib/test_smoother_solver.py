@@ -13,9 +13,9 @@ from smoother_legs import made, truth
 
 from odocal_ros.data.arrays import MAX_RESIDENT_BYTES, release_mapped_memory, work_array
 from odocal_ros.estimator import cramer_rao_bound
-from odocal_ros.estimator.chain import Normal, NotPositive, solve
+from odocal_ros.estimator.chain import NormalEquations, NotPositive, solve
 from odocal_ros.estimator.cold_start import cold_starts
-from odocal_ros.estimator.equations import Equations, Weighted
+from odocal_ros.estimator.equations import Equations, WeightedEquations
 from odocal_ros.estimator.factors.axle import mean_rates_at
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.pseudo_observations import (
@@ -132,7 +132,7 @@ def _dense(seed=0, rows=8):
 def _as_chain(H, g):
     b = [slice(k * STATES, (k + 1) * STATES) for k in range(N)]
     c = slice(N * STATES, TOTAL)
-    out = Normal(N, STATES, BORDER)
+    out = NormalEquations(N, STATES, BORDER)
     out.diagonal[:] = [H[s, s] for s in b]
     out.upper[:] = [H[b[k], b[k + 1]] for k in range(N - 1)]
     out.coupling[:] = [H[s, c] for s in b]
@@ -143,16 +143,17 @@ def _as_chain(H, g):
 
 def test_step_and_covariances_equal_those_of_a_dense_solve():
     H, g = _dense()
-    solved = solve(_as_chain(H, g))
+    solution = solve(_as_chain(H, g))
     # the dense inverse of the scaled matrix: with a condition of 1e4 the limit is 1e-10
     s = 1 / np.sqrt(np.diag(H))
     P = np.linalg.inv(H * np.outer(s, s)) * np.outer(s, s)
     x = P @ g
-    np.testing.assert_allclose(np.append(solved.step.ravel(), solved.step_constants), x, rtol=1e-9)
+    steps = np.append(solution.step.ravel(), solution.step_constants)
+    np.testing.assert_allclose(steps, x, rtol=1e-9)
     c = np.arange(N * STATES, TOTAL)
-    np.testing.assert_allclose(solved.covariance, P[np.ix_(c, c)], rtol=1e-9)
-    assert solved.log_determinant == pytest.approx(np.linalg.slogdet(H)[1], abs=1e-9)
-    near = solved.marginals()
+    np.testing.assert_allclose(solution.covariance, P[np.ix_(c, c)], rtol=1e-9)
+    assert solution.log_determinant == pytest.approx(np.linalg.slogdet(H)[1], abs=1e-9)
+    near = solution.marginals()
     for k in range(N - 1):
         i = np.r_[k * STATES:(k + 2) * STATES, c]
         np.testing.assert_allclose(near[k], P[np.ix_(i, i)], rtol=1e-8,
@@ -161,11 +162,11 @@ def test_step_and_covariances_equal_those_of_a_dense_solve():
 
 def test_absent_constants_have_their_priors_in_the_marginal_information():
     H, g = _dense()
-    solved = solve(_as_chain(H, g))
+    solution = solve(_as_chain(H, g))
     normal, weights = _as_chain(H, g), np.array([4.0, 0.25])
     normal.unused_weights = weights
     some = solve(normal)
-    whole, part = Normal(N, STATES, BORDER + 2), _as_chain(H, g)
+    whole, part = NormalEquations(N, STATES, BORDER + 2), _as_chain(H, g)
     for to, of in zip((whole.diagonal, whole.upper, whole.g),
                       (part.diagonal, part.upper, part.g), strict=True):
         to[:] = of
@@ -181,7 +182,7 @@ def test_absent_constants_have_their_priors_in_the_marginal_information():
     wide = np.concatenate([border, np.zeros((2, 2))])
     for found, want in zip((squares, moves), all_of.quadratic_forms(sides, wide), strict=True):
         np.testing.assert_allclose(found, want, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(some.marginals()[1], solved.marginals()[1], rtol=1e-12)
+    np.testing.assert_allclose(some.marginals()[1], solution.marginals()[1], rtol=1e-12)
 
 
 def test_unconstrained_state_is_reported():
@@ -203,10 +204,10 @@ def peak_of_a_pass(duration):
     state = cold_starts(leg, problem.imu, problem.priors, 0.0)[0].state
     levels = problem.initial_levels.replaced(correlation_time=60.0)
     tracemalloc.start()
-    weighted = Weighted(Equations(problem, state), levels)
-    solved = solve(weighted.normal())
-    weighted.apply_step(solved)
-    near = solved.marginals()
+    weighted = WeightedEquations(Equations(problem, state), levels)
+    solution = solve(weighted.normal())
+    weighted.apply_step(solution)
+    near = solution.marginals()
     weighted.components(near)
     weighted[MotionRows].road_noise(near)
     peak = tracemalloc.get_traced_memory()[1]

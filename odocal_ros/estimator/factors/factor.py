@@ -18,7 +18,7 @@ import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.data.arrays import blocks, Floats
-from odocal_ros.estimator.chain import JointMarginals, Normal
+from odocal_ros.estimator.chain import JointMarginals, NormalEquations
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points
 from odocal_ros.estimator.problem import Problem
@@ -93,7 +93,7 @@ class Factor:
     def weigh(self, levels: Levels) -> None:
         """Compute everything that depends on the levels."""
 
-    def add(self, out: Normal) -> None:
+    def add(self, out: NormalEquations) -> None:
         """Add the rows to normal equations."""
 
     def apply_step(self, step: Floats, constants: Floats, new_state: State) -> None:
@@ -126,7 +126,7 @@ class Factor:
                                for block in marginals.blocks()])
 
 
-def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
+def add_prior(out: NormalEquations, k: int | slice, columns: slice, variance: Floats | float,
               residual: Floats | float, weight: Floats | float = 1.0) -> None:
     """Add priors of columns at keyframes k; residual : value minus mean.   weight 0 : no prior."""
     i = np.arange(out.g.shape[1])[columns]
@@ -138,7 +138,7 @@ def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | fl
         out.g[keyframes[rows], i] -= gradient[rows]
 
 
-def add_process(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
+def add_process(out: NormalEquations, columns: slice, decay: Floats | float, weight: Floats,
                 residual: Floats) -> None:
     """
     Add a Gauss-Markov process, or with decay 1 a random walk, of columns of the keyframes.

@@ -13,7 +13,7 @@ from weakref import ref
 import numpy as np
 
 from odocal_ros.data.arrays import blocks, Bools, Floats, work_array
-from odocal_ros.estimator.chain import JointMarginals, Normal
+from odocal_ros.estimator.chain import JointMarginals, NormalEquations
 from odocal_ros.estimator.factors.factor import Factor, IMU, LinearisationPoint
 from odocal_ros.estimator.factors.interval_noise import ALONG, INTERVAL, motion_noise, road_levels
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
@@ -24,11 +24,12 @@ from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import ACCEL, BG, GYRO, MEAN_ROLL, P, State, V
 
-# sources in the budget, by level
-NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
-         'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise',
-         'along_hard': 'travel_noise', 'side': 'sideslip', 'side_turn': 'sideslip',
-         'up': 'vertical_motion', 'pitching': 'vertical_motion'}
+# by level
+BUDGET_SOURCES = {
+    'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
+    'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise', 'along_hard': 'travel_noise',
+    'side': 'sideslip', 'side_turn': 'sideslip', 'up': 'vertical_motion',
+    'pitching': 'vertical_motion'}
 ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up', 'pitching'))
 
 
@@ -112,7 +113,7 @@ class MotionRows(Factor):
         out: Floats = axes[:, 0] * other[:, None]
         return out
 
-    def add(self, out: Normal) -> None:
+    def add(self, out: NormalEquations) -> None:
         n = self.n
         for rows in blocks(len(self.r)):
             ends, J = slice(rows.start + 1, rows.stop + 1), self.J[rows]
@@ -186,7 +187,7 @@ class MotionRows(Factor):
             by_known.append(by_rows @ (self.whiten[rows] @ self.noise.known_columns[rows]))
         effects = np.concatenate(by_unit)
         for name in INTERVAL:
-            yield NAMES[name], effects[:, :, self.noise_mask(name)]
+            yield BUDGET_SOURCES[name], effects[:, :, self.noise_mask(name)]
         if self.noise.known_columns.shape[2]:
             yield SpeedSteps.source, np.concatenate(by_known)
 

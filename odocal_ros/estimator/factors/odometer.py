@@ -17,7 +17,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, runs
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.chain import JointMarginals, Normal
+from odocal_ros.estimator.chain import JointMarginals, NormalEquations
 from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import PointRows
@@ -98,7 +98,7 @@ class TravelError(Factor):
         self.variance = max(self.min_variance, levels['travel'])
         self.log_R = self.weight.sum() * np.log(self.variance)
 
-    def add(self, out: Normal) -> None:
+    def add(self, out: NormalEquations) -> None:
         add_prior(out, slice(None), slice(E, E + 1), self.variance,
                   self.state.travel_error[:, None], self.weight[:, None])
 

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from odocal_ros.data.arrays import blocks, Bools, Floats, Ints, work_array
-from odocal_ros.estimator.chain import JointMarginals, Normal
+from odocal_ros.estimator.chain import JointMarginals, NormalEquations
 from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
 from odocal_ros.estimator.leg import ExternalSamples, SmootherLeg
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
@@ -130,7 +130,7 @@ class PointRows(Factor):
         if self.J_end is not None:
             self.r = self.r + np.einsum('kij,kj->ki', self.J_end, step[self.k + 1, SLOW])
 
-    def add(self, out: Normal) -> None:
+    def add(self, out: NormalEquations) -> None:
         n = self.n
         for present, gather in self._intervals():
             J, r = gather(self.J), gather(self.r[:, :, None])

@@ -16,7 +16,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.chain import JointMarginals, Normal
+from odocal_ros.estimator.chain import JointMarginals, NormalEquations
 from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
@@ -132,7 +132,7 @@ class PriorRows(factor.Factor):
         """Return the constants minus their prior means: (M,)."""
         return self.state.constants - self.priors.mean
 
-    def add(self, out: Normal) -> None:
+    def add(self, out: NormalEquations) -> None:
         # the first keyframe has a wide prior, with its value as mean
         for columns, sigma in START_SIGMAS:
             factor.add_prior(out, 0, columns, sigma**2, 0.0)
@@ -180,7 +180,7 @@ class StandstillRows(factor.Factor):
         C = self.state.C_nb
         return rotvec(C[1:] @ transpose(C[:-1]))
 
-    def add(self, out: Normal) -> None:
+    def add(self, out: NormalEquations) -> None:
         weight = self.at_rest[:, None] / STILL_SPEED**2
         factor.add_prior(out, slice(None), V, 1.0, self.state.v_n, weight)
         factor.add_process(out, PHI, 1.0, self.intervals_at_rest[:, None] / self.turn_variance,

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.chain import JointMarginals, Normal
+from odocal_ros.estimator.chain import JointMarginals, NormalEquations
 from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
@@ -73,7 +73,7 @@ class SlowError(factor.Factor):
         s = self.state.slow_n
         return s[1:] - self.decay * s[:-1]
 
-    def add(self, out: Normal) -> None:
+    def add(self, out: NormalEquations) -> None:
         factor.add_process(out, SLOW, self.decay, 1 / self.noise_variance, self.residual())
         factor.add_prior(out, 0, SLOW, self.variance, self.state.slow_n[0])
 

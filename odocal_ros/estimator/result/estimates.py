@@ -125,7 +125,7 @@ def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformatio
     setting_values : (M,) as ``configured_constants``.
     """
     constants, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
-    reduced, g_reduced = fit.solved.reduced, fit.solved.g_reduced
+    reduced, g_reduced = fit.solution.reduced, fit.solution.g_reduced
     # LEG_CONSTANTS are eliminated, with their priors
     leg_rows = reduced[layout.LEG_CONSTANTS]
     gain = np.linalg.solve(leg_rows[:, layout.LEG_CONSTANTS], leg_rows).T

@@ -130,7 +130,7 @@ def _convergence_texts(fit: Fit) -> tuple[dict[str, str], float]:
     """Return text and remedy of a fit that has not converged, and its last step in sigmas."""
     if not fit.slowly_converging and fit.converged:
         return {}, 0.0
-    steps = fit.solved.step_constants / np.sqrt(np.diag(fit.solved.covariance))
+    steps = fit.solution.step_constants / np.sqrt(np.diag(fit.solution.covariance))
     step = float(np.abs(steps[:PARAMETER_COUNT]).max())      # of scale, yaw and pitch
     return {f'after {fit.iterations} iterations ' + (
         f'the estimates still changed by {step:.2g} sigma '

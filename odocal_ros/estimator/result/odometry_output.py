@@ -130,7 +130,7 @@ def _housing_sigma(error: float, error_sigma: float, sigma: float, misalignment:
 
 def level_pitch(fit: Fit, marginals: JointMarginals, factor: float) -> dict[str, Any]:
     """Return the pitch mounting relative to the level of the accelerometer with its bias."""
-    k, n = len(marginals) // 2, fit.solved.step.shape[1]
+    k, n = len(marginals) // 2, fit.solution.step.shape[1]
     rows = np.array([2 * n + layout.PITCH, layout.BA.start])
     C = marginals[k][np.ix_(rows, rows)]
     gradient = np.array([1.0, -1 / G])

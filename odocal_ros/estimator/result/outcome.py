@@ -64,8 +64,8 @@ class _Posterior:
 
 
 def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
-    """Return the result of a fit; ``fit.solved`` cannot be used afterwards."""
-    marginals = fit.solved.marginals()
+    """Return the result of a fit; ``fit.solution`` cannot be used afterwards."""
+    marginals = fit.solution.marginals()
     factor, reasons = find_mismatch(problem, fit, config)
     # only the steps of a coarse speed are used, which do not show slip
     slips: tuple[residuals.Slip, ...] = ()
@@ -253,7 +253,7 @@ def _external_details(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, di
 
 def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
     """Return the error sources of ln K, yaw and pitch, (S32); the rest is that of standstills."""
-    solved = fit.solved.covariance
+    solution = fit.solution.covariance
     covariance: dict[str, np.ndarray] = {}
     for factor in fit.weighted.factors.values():
         for name, effects in factor.effects(marginals):
@@ -261,8 +261,8 @@ def error_sources(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
             columns = np.moveaxis(effects, -2, 0).reshape(PARAMETER_COUNT, -1)
             covariance[name] = covariance.get(name, 0.0) + columns @ columns.T
     shared = [Source(name, effects, True)
-              for name, effects in fit.weighted[PriorRows].shared_effects(solved)]
-    rest = solved[:PARAMETER_COUNT, :PARAMETER_COUNT] - sum(covariance.values()) - sum(
+              for name, effects in fit.weighted[PriorRows].shared_effects(solution)]
+    rest = solution[:PARAMETER_COUNT, :PARAMETER_COUNT] - sum(covariance.values()) - sum(
         s.effects @ s.effects.T for s in shared)
     by_levels = fit.by_levels[:PARAMETER_COUNT]
     for name, effects in (('noise_levels', by_levels[:, :-len(SIZES)]),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import blocks, Floats
 from odocal_ros.estimator.chain import JointMarginals
-from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator.equations import WeightedEquations
 from odocal_ros.estimator.factors.gnss import Fixes
 from odocal_ros.estimator.factors.interval_noise import ABSENT_VARIANCE, accelerating_and_turning
 from odocal_ros.estimator.factors.motion import D
@@ -79,7 +79,7 @@ def correlation(t: Floats, residual: Floats) -> float:
     return float((mean[adjacent] * mean[adjacent + 1]).mean() / power)
 
 
-def normalised_residuals(weighted: Weighted) -> dict[str, dict[str, float]]:
+def normalised_residuals(weighted: WeightedEquations) -> dict[str, dict[str, float]]:
     """Return rms, number and outlier share of whitened residuals, without weights, by sensor."""
     motion, fixes = weighted[MotionRows].r, weighted[Fixes]
     white = fixes.r / np.sqrt(fixes.weight / fixes.rows_per_independent)
