@@ -11,6 +11,7 @@ import numpy as np
 from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.estimator import make_smoother_leg, smooth, state as layout
 from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.body_tilt import BodyTilt
 from odocal_ros.estimator.factors.motion import D
 from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
@@ -110,6 +111,11 @@ def at_truth(t_stop=None, **options):
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, **options)
     leg = replace(leg, t_stop=t_stop or leg.t_stop)
     return drive, make_problem(leg, config), truth(drive, config, leg)
+
+
+def pitch_increments(motion):
+    """Return ``pitch_increments`` of the tilt of the body in a motion: (K, 4) rad."""
+    return BodyTilt(motion.state, motion.sums.mean_rate, motion.axle).pitch_increments
 
 
 def along_axis(problem, state, axis, constants):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from smoother_legs import along_axis, at_truth
+from smoother_legs import along_axis, at_truth, pitch_increments
 
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import Equations
@@ -52,7 +52,7 @@ def test_turn_on_banked_ground_pitches_the_vehicle_about_its_left_axis(banking):
     want = -rate * motion.T[:, 0] * np.sin(np.arctan(banking * speed * rate / G))
     steady = np.abs(np.gradient(rate)) < 0.01        # the lean is that at the start
     assert np.abs(want[steady]).max() >= 0.06 * banking
-    np.testing.assert_allclose(motion.tilt.pitch_increments[steady, 2], want[steady], atol=5e-3)
+    np.testing.assert_allclose(pitch_increments(motion)[steady, 2], want[steady], atol=5e-3)
 
 
 def lateral_acceleration(motion, state):
@@ -137,5 +137,5 @@ def test_bumps_may_have_a_different_tilt_centre_than_hills():
     hill, bump = (np.sin(2 * np.pi * np.arange(len(motion.T)) / period) for period in (40.0, 2.5))
     assert follow_hills(hill)[INSIDE] == pytest.approx(hill[INSIDE], abs=1e-3)
     assert follow_hills(bump)[INSIDE] == pytest.approx(-BUMP_GAIN * bump[INSIDE], abs=1e-4)
-    body = motion.tilt.pitch_increments[:, 1]
+    body = pitch_increments(motion)[:, 1]
     assert body == pytest.approx(-np.diff(motion.axle.body_pitch()))

@@ -8,7 +8,7 @@ from dataclasses import replace
 from drives import ANGLES, configured, off
 import numpy as np
 import pytest
-from smoother_legs import along_axis, at_truth, made, truth
+from smoother_legs import along_axis, at_truth, made, pitch_increments, truth
 
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import Equations, preintegrate_at as preintegrated
@@ -69,7 +69,7 @@ def test_turn_of_a_rolled_body_does_not_pitch_it(perfect):
     rolled = state.C_nb @ matrix_from_rpy([0.1, 0.0, 0.0])      # level body; mounting of 1 deg
     leaning = replace(state, C_nb=rolled)
     measured = rotate(transpose(rolled[:-1]), rate_n)
-    upright, other = (Motion(problem, one, steps).tilt.pitch_increments[:, 0] for one, steps in (
+    upright, other = (pitch_increments(Motion(problem, one, steps))[:, 0] for one, steps in (
         (state, preintegrate_at), (leaning, replace(preintegrate_at, mean_rate=measured))))
     # an error would make a tenth of a turn of 0.2 rad pitch; the roll changes the heading of the
     # mounting by 0.1 times some degrees, which rotates the real pitch

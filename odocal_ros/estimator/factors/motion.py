@@ -161,9 +161,9 @@ class Motion:
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES, None] \
             + self.half_pitch_variance[:, None] * c[layout.SCALE_BY_PITCHING]
         pitch, yaw = self.lean_angles
-        self.tilt = BodyTilt(state, self.sums.mean_rate, self.axle)
-        self.rate_n, self.level_left = self.tilt.rate_n, self.tilt.level_left
-        self.by_tilt = self.tilt.displacements
+        tilt = BodyTilt(state, self.sums.mean_rate, self.axle)
+        self.rate_n, self.level_left = tilt.rate_n, tilt.level_left
+        self.by_tilt = tilt.displacements
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _inclination_ratio(self, straight: Floats) -> Floats:
