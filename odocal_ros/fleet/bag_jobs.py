@@ -195,10 +195,8 @@ def _resource_limits(job: BagJob, store_failure: Callable[[str], None]) -> Itera
 
 def _data_bytes() -> int:
     """Return the private data memory of this process, bytes."""
-    for line in Path('/proc/self/status').read_text().splitlines():
-        if line.startswith('VmData:'):
-            return int(line.split()[1]) * 1024
-    return 0
+    status = Path('/proc/self/status').read_text().splitlines()
+    return next((int(line.split()[1]) * 1024 for line in status if line.startswith('VmData:')), 0)
 
 
 def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, time_limit_s: float,

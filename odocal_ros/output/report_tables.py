@@ -4,6 +4,7 @@
 """The tables of the report as rows of text: values, methods, budget, unused data, origin."""
 
 from collections import Counter
+from contextlib import suppress
 import math
 from typing import Any
 
@@ -68,11 +69,11 @@ def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
 def headline(calibration: result.Calibration) -> list[tuple[str, str, str]]:
     """Return the most important values, up to four: name, value, a second line."""
     lines = []
-    for name, text in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
-                       ('pitch_mounting_angle', 'pitch mounting')):
+    for name in texts.MAIN_VALUES:
         first, other, relative = estimate_texts(
             name, texts.finite_estimate(calibration.estimates, name))
-        lines.append((text, first, f'± {relative}' if relative else other))
+        lines.append((name.removesuffix('_angle').replace('_', ' '), first,
+                      f'± {relative}' if relative else other))
     for longest in tables.pooled_per_distance(calibration.legs)[-1:]:
         lines.append((f'track error in {texts.length_text(longest.length)}',
                       texts.length_text(longest.after),
@@ -83,17 +84,16 @@ def headline(calibration: result.Calibration) -> list[tuple[str, str, str]]:
 
 def undetermined(calibration: result.Calibration) -> list[str]:
     """Return the values that were not determined, axes of one quantity together."""
-    axes: dict[str, list[str]] = {}
-    local = result.has_local_positions(calibration.legs)
+    axes: dict[str, list[str]] = {}      # by quantity
     for name in calibration.estimates:
         # the ratio requires a nominal scale, not another drive
         value = texts.finite_estimate(calibration.estimates, name).value
         if value is None and name != 'scale_ratio':
-            quantity, _, axis = name.rpartition('_')
-            has_axis = axis in ('x', 'y', 'z')
-            axes.setdefault(label(quantity if has_axis else name, local), []).extend(
-                [axis] * has_axis)
-    return [f'{text} {", ".join(axis_names)}'.rstrip() for text, axis_names in axes.items()]
+            has_axis = name[-2:] in ('_x', '_y', '_z')
+            axes.setdefault(name[:-2] if has_axis else name, []).extend(name[-1] * has_axis)
+    local = result.has_local_positions(calibration.legs)
+    return [f'{label(quantity, local)} {", ".join(names)}'.rstrip()
+            for quantity, names in axes.items()]
 
 
 def method_table(methods: dict[str, result.MethodResult],
@@ -204,8 +204,6 @@ def versions(software: str) -> list[tuple[str, str]]:
     installed = [('odocal_ros', software.rpartition(' ')[2]),
                  ('Python', platform.python_version())]
     for name in ('numpy', 'scipy', 'pyproj', 'rosbags', 'matplotlib', 'jinja2'):
-        try:
+        with suppress(PackageNotFoundError):
             installed.append((name, version(name)))
-        except PackageNotFoundError:
-            continue
     return installed

@@ -139,11 +139,10 @@ def _other_lines(estimates: dict[str, result.Estimate], wheels: dict[str, str]) 
 def _gyro_bias_line(estimates: dict[str, result.Estimate]) -> str:
     """Return the line of the gyro bias, empty if an axis is not known."""
     biases = [texts.finite_estimate(estimates, name) for name in BIASES]
-    if any(bias.value is None for bias in biases):
-        return ''
-    shown = ', '.join(texts.with_sigma(bias.value, bias.sigma, DEG_PER_HOUR, signed=True)
-                      for bias in biases)
-    return _line('gyro bias x, y, z', f'{shown} deg/h')
+    values = ', '.join(texts.with_sigma(bias.value, bias.sigma, DEG_PER_HOUR, signed=True)
+                       for bias in biases)
+    is_known = all(bias.value is not None for bias in biases)
+    return _line('gyro bias x, y, z', f'{values} deg/h') if is_known else ''
 
 
 def rotation_text(calibration: result.Calibration, width: int = texts.WIDTH) -> str:
@@ -228,9 +227,8 @@ def _largest_error_lines(calibration: result.Calibration, width: int) -> list[st
     largest = []
     for name, short_name in texts.MAIN_VALUES.items():
         estimate = texts.finite_estimate(calibration.estimates, name)
-        source, share = ('', 0.0) if estimate.value is None else tables.largest_source(
-            calibration.methods.get(estimate.method), name)
-        if source:
+        source, share = tables.largest_source(calibration.methods.get(estimate.method), name)
+        if source and estimate.value is not None:
             label = tables.source_label(source, result.has_local_positions(calibration.legs))
             largest.append(f'{short_name}: {label} ({100 * share:.0f} %)')
     # lines are broken between the values only; 3: indent, and space after the label

@@ -223,11 +223,10 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, min_shar
         cells = ['-' if share < min_share else f'{significant(effect * factor)} {share:>4.0%}'
                  for effect, factor, share in zip(row.effects, factors, row.shares, strict=True)]
         lines.append(texts.table_row([row.label, *cells], BUDGET_WIDTHS) + shared * row.shared)
-    if not (small and name_small):
-        return lines
-    limit = f'{min_share:.1%}'.replace('.0%', '%').replace('%', ' %')
-    return lines + textwrap.wrap(f'under {limit}: {", ".join(small)}', width, initial_indent='  ',
-                                 subsequent_indent='    ')
+    if small and name_small:
+        lines += textwrap.wrap(f'under {100 * min_share:g} %: {", ".join(small)}', width,
+                               initial_indent='  ', subsequent_indent='    ')
+    return lines
 
 
 def pooled_check(checks: list[tuple[result.TrackCheck | None, int]]) -> result.TrackCheck | None:
@@ -249,12 +248,10 @@ def pooled_check(checks: list[tuple[result.TrackCheck | None, int]]) -> result.T
 
 def pooled_per_distance(legs: Sequence[result.LegResult]) -> list[result.PerDistance]:
     """Return the error per distance driven of all legs, pooled over sections."""
-    by_distance: dict[float, list[result.PerDistance]] = {}
-    for leg in legs:
-        for error in leg.per_distance:
-            by_distance.setdefault(error.length, []).append(error)
+    all_errors = [error for leg in legs for error in leg.per_distance]
     pooled = []
-    for distance, errors in sorted(by_distance.items()):
+    for distance in sorted({error.length for error in all_errors}):
+        errors = [error for error in all_errors if error.length == distance]
         count = sum(error.pieces for error in errors)
         before, after = (
             math.sqrt(sum(error.pieces * getattr(error, name)**2 for error in errors) / count)
@@ -264,11 +261,10 @@ def pooled_per_distance(legs: Sequence[result.LegResult]) -> list[result.PerDist
 
 
 def before_label(legs: Sequence[result.LegResult]) -> str:
-    """Return the label of the track before calibration."""
-    configured = any(
-        method.estimates.get('scale_ratio', texts.UNKNOWN).value is not None
-        for leg in legs for method in leg.methods.values())
-    return 'as configured' if configured else 'uncalibrated'
+    """Return the label of the track before calibration, by whether a nominal scale is set."""
+    has_nominal = any(method.estimates.get('scale_ratio', texts.UNKNOWN).value is not None
+                      for leg in legs for method in leg.methods.values())
+    return 'as configured' if has_nominal else 'uncalibrated'
 
 
 def check_table(
@@ -296,6 +292,6 @@ def track_lines(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
     if not rows:
         return []
     column_count = (width - CHECK_LABEL_WIDTH) // CHECK_CELL_WIDTH
-    return [texts.table_row([label, *cells[:column_count]], [
-        CHECK_LABEL_WIDTH - 2, *[CHECK_CELL_WIDTH] * len(cells[:column_count])])
+    widths = [CHECK_LABEL_WIDTH - 2, *[CHECK_CELL_WIDTH] * len(heads[:column_count])]
+    return [texts.table_row([label, *cells[:column_count]], widths)
             for label, cells in (('track against fixes', heads), *rows)]
