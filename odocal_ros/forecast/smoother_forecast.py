@@ -115,7 +115,7 @@ def _forecast_scale(running: RunningEstimate, limit: float) -> ParameterForecast
     sigma = float(running.sigmas[0])
     slow = _slow_share(running)
     power = PATH_POWER_SLOW * slow + PATH_POWER * (1 - slow)
-    metres = _remaining_distance(running, sigma / limit, power)
+    metres = _remaining_distance(running.distance, sigma, limit, power)
     value = '' if scale.value is None or scale.sigma is None else format_value(
         scale.value, scale.sigma)
     if value and scale.unit != '1':
@@ -137,21 +137,24 @@ def _forecast_yaw(running: RunningEstimate, limit: float) -> ParameterForecast:
     """Return the forecast of the yaw: its information is proportional to running.agility."""
     yaw = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
-    ratio, manoeuvre = sigma / limit, ''
-    if ratio > 1:
+    manoeuvre = ''
+    if sigma > limit:
         stop_agility = 2 * STOP_ACCELERATION * max(running.speed, STOP_SPEED)
-        stops = math.ceil(max(running.agility, stop_agility / 2) * (ratio**2 - 1) / stop_agility)
-        times = 'often' if stops > MAX_STOPS else f'{stops} time{"s" * (stops > 1)}'
+        ratio = sigma / limit if limit else math.inf
+        stops = max(running.agility, stop_agility / 2) * (ratio**2 - 1) / stop_agility
+        times = 'often' if stops > MAX_STOPS else f'{math.ceil(stops)} time{"s" * (stops > 1)}'
         manoeuvre = f'for the yaw: stop and start {times}, or make as many turns'
     value = '' if yaw.value is None or yaw.sigma is None else format_value(
         math.degrees(yaw.value), math.degrees(yaw.sigma))
-    return ParameterForecast(sigma, limit, _remaining_distance(running, ratio, 2.0),
-                             main_sources(running.method, YAW), '', value, manoeuvre)
+    metres = _remaining_distance(running.distance, sigma, limit, 2.0)
+    return ParameterForecast(sigma, limit, metres, main_sources(running.method, YAW), '',
+                             value, manoeuvre)
 
 
-def _remaining_distance(running: RunningEstimate, ratio: float, power: float) -> float | None:
-    """Return the further distance that improves a sigma by a ratio, driven as so far, m."""
-    metres = running.distance * (max(ratio, 1.0)**power - 1)
+def _remaining_distance(distance: float, sigma: float, limit: float,
+                        power: float) -> float | None:
+    """Return the further distance that brings a sigma to its limit, driven as so far, m."""
+    metres = distance * (max(sigma / limit, 1.0)**power - 1) if limit else math.inf
     return metres if metres <= FARTHEST_LIMIT_M else None
 
 
@@ -193,7 +196,6 @@ def _planar_scale(result: LegResult, limit: float) -> ParameterForecast:
     sigma = scale.relative_sigma
     if sigma is None or scale.value is None or scale.sigma is None:
         return ParameterForecast(None, limit, None, manoeuvre=DRIVE_ON)
-    metres = result.distance * max((sigma / limit)**2 - 1, 0.0) if limit else math.inf
     return ParameterForecast(
-        sigma, limit, metres if metres <= FARTHEST_LIMIT_M else None,
+        sigma, limit, _remaining_distance(result.distance, sigma, limit, 2.0),
         limitation=UNREACHABLE_TEXT, value_text=format_value(scale.value, scale.sigma))

@@ -89,7 +89,7 @@ def test_forecast_distance_and_stops_are_near_those_required(town_drive, exact):
         (early.sigmas[1] / late.sigmas[1])**2, rel=0.5)
 
 
-def of_sigmas(seen, scale=1e-4, yaw=1e-3, agility=120.0, known=True):
+def of_sigmas(seen, scale=1e-4, yaw=1e-3, agility=120.0, known=True, limit=None):
     """Return a forecast from a running estimate with other sigmas."""
     method = seen.running.method
     found = dict(method.estimates)
@@ -97,8 +97,8 @@ def of_sigmas(seen, scale=1e-4, yaw=1e-3, agility=120.0, known=True):
         found['yaw_mounting_angle'] = Estimate(None, None, 'rad')
     running = replace(seen.running, method=replace(method, estimates=found), agility=agility,
                       sigmas=np.array([scale, yaw, 1e-3]), speed=10.0, distance=500.0)
-    before = Forecast(ParameterForecast(0.1, 1e-3, 500.0),
-                      ParameterForecast(None, 0.01, None, (), 'not told'))
+    before = Forecast(ParameterForecast(0.1, 1e-3 if limit is None else limit, 500.0),
+                      ParameterForecast(None, 0.01 if limit is None else limit, None, (), ''))
     return add_running_estimate(before, running, Config())
 
 
@@ -120,6 +120,13 @@ def test_the_yaw_requires_stops_and_starts_until_it_is_within_the_limit(updates)
         'yaw is not determined yet (2.86 deg)')
     good = of_sigmas(updates[-1], yaw=0.009)
     assert (good.yaw.manoeuvre, good.yaw.remaining_m, good.is_complete) == ('', 0.0, True)
+
+
+def test_a_limit_of_zero_is_never_reached(updates):
+    found = of_sigmas(updates[-1], limit=0.0)
+    assert found.scale.remaining_m is None
+    assert found.yaw.remaining_m is None
+    assert found.yaw.manoeuvre == 'for the yaw: stop and start often, or make as many turns'
 
 
 def test_the_hint_states_the_value_what_is_missing_and_its_age(updates):
