@@ -45,42 +45,42 @@ class TestedChange:
         return math.inf if old_sigma is None else old_sigma / new_sigma
 
 
-def tested_changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[TestedChange]:
+def _tested_changes(plan: 'Planned') -> list[TestedChange]:
     """Return the changes of drive and sensors, each with the sigmas that it leads to."""
     # with the keyframe spacing of this drive: a wider one alone makes a sigma larger
-    spacing = keyframe_spacing(drive)
+    spacing = keyframe_spacing(plan.drive)
+    variants = [(text, drive, plan.sigmas) for text, drive in _other_drives(plan)]
+    variants += [(text, plan.drive, sigmas) for text, sigmas in _better_sensors(plan)]
     results = []
-    variants = [(text, other, sigmas) for text, other in _other_drives(drive, sigmas, before)]
-    variants += [(text, drive, better) for text, better in _better_sensors(sigmas, before)]
-    for text, other_drive, other_sigmas in variants:
-        after = plan_methods(other_drive, other_sigmas, spacing)
+    for text, drive, sigmas in variants:
+        after = plan_methods(drive, sigmas, spacing)
         results.append(TestedChange(text, {name: after.sigma(name) for name in (SCALE, YAW)}))
-    return results + _second_leg(drive, sigmas, before)
+    return results + _second_leg(plan)
 
 
-def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
-                  before: Plan) -> Iterator[tuple[str, PlannedDrive]]:
+def _other_drives(plan: 'Planned') -> Iterator[tuple[str, PlannedDrive]]:
     """Yield (text, drive) of drives that are longer or have more manoeuvres."""
+    drive = plan.drive
     yield f'{length_text(drive.distance)} more, straight ahead', drive.lengthen(drive.distance)
     min_rest = 60.0    # s
-    rest = max(min_rest, *before.two_point.rests)
+    rest = max(min_rest, *plan.two_point.rests)
     yield f'standing {duration_text(rest)} longer at both marks', drive.lengthen_rests(rest)
     yield 'one more stop and start', planned_drive.add_stop_and_start(drive)
     yield 'one more left turn and right turn', planned_drive.add_left_and_right_turns(drive)
     town_minutes = 5
     yield (f'{town_minutes} min more, stop and go with turns',
            planned_drive.add_town_driving(drive, town_minutes))
-    farthest = _until_farthest(drive, sigmas)
+    farthest = _until_farthest(drive, plan.sigmas.config.leg.standstill)
     if farthest is not None:
         yield f'end mark at the farthest point ({length_text(farthest.distance)})', farthest
 
 
-def _better_sensors(sigmas: Sigmas, before: Plan) -> Iterator[tuple[str, Sigmas]]:
+def _better_sensors(plan: 'Planned') -> Iterator[tuple[str, Sigmas]]:
     """Yield (text, sigmas) with better fixes, heading and IMU."""
+    sigmas, alignment = plan.sigmas, plan.two_point.alignment
     if sigmas.fix > 2 * RTK_SIGMA:
         yield (f'RTK fixes ({RTK_SIGMA:g} m)',
                replace(sigmas, fix=RTK_SIGMA, fix_up=2 * RTK_SIGMA))
-    alignment = before.two_point.alignment
     heading_sigma = alignment.heading_sigma if alignment.heading_separable else math.inf
     two_antennas = math.radians(0.1)    # sigma of a heading with a base line of 1 to 2 m
     better_sigma = two_antennas if heading_sigma > 2 * two_antennas else heading_sigma / 2
@@ -94,8 +94,12 @@ def _better_sensors(sigmas: Sigmas, before: Plan) -> Iterator[tuple[str, Sigmas]
         yield f'an IMU of {better_grades[0]} grade', replace(sigmas, config=config)
 
 
-def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
-    """Return the drive up to its farthest point from the start, None if that is the end."""
+def _until_farthest(drive: PlannedDrive, min_rest: float) -> PlannedDrive | None:
+    """
+    Return the drive up to its farthest point from the start, None if that is the end.
+
+    min_rest : s of a standstill; the drive ends with one that is there, else with DEFAULT_REST.
+    """
     inside = drive.t >= 0
     # east + i north, from steps of travel in the direction of the yaw
     position = np.cumsum(np.gradient(drive.travel[inside]) * np.exp(1j * drive.yaw[inside]))
@@ -105,44 +109,37 @@ def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
     if from_start[-1] > end_share * from_start[farthest]:
         return None
     t_farthest = drive.t[inside][farthest]
-    rest = max((end - begin for begin, end in drive.standstills(sigmas.config.leg.standstill)
+    rest = max((end - begin for begin, end in drive.standstills(min_rest)
                 if begin <= t_farthest <= end), default=DEFAULT_REST)
     moving = np.flatnonzero((np.abs(drive.speed) > REST_SPEED) & (drive.t <= t_farthest))
     return drive.cut_at(float(drive.t[min(moving[-1] + 1, len(drive.t) - 1)]), rest)
 
 
-def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[TestedChange]:
+def _second_leg(plan: 'Planned') -> list[TestedChange]:
     """Return the change to two legs, the second in the opposite direction; [] without a scale."""
-    if before.sigma(SCALE) is None:
+    if plan.sigma(SCALE) is None:
         return []
-    opposite = predict(drive.turn_around(), sigmas).method
+    opposite = predict(plan.drive.turn_around(), plan.sigmas).method
     combined: dict[str, float | None] = {SCALE: None, YAW: None}
     for parameter in combined:
-        name = before.method_of(parameter)
+        name = plan.method_of(parameter)
         if not name:
             continue
-        first = before.methods[name]
+        first = plan.methods[name]
         # the smoother works in body axes: the direction of the drive does not matter
         second = opposite if name == 'two_point' else first
         legs = [_with_dummy_values(leg) for leg in (first, second)]
-        both = combine_results(name, legs, (0, round(drive.duration * 1e9)), sigmas.config)
+        both = combine_results(name, legs, (0, round(plan.drive.duration * 1e9)),
+                               plan.sigmas.config)
         combined[parameter] = both.estimates[parameter].sigma
     return [TestedChange('a second leg in the other direction', combined)]
 
 
 def _with_dummy_values(method: MethodResult) -> MethodResult:
-    """Return the method with 0 for parameters without a value: only values are combined."""
+    """Return the method with 0 +- 0 for missing values, without which legs are not combined."""
     return replace(method, estimates={
         name: estimate if estimate.value is not None else Estimate(0.0, 0.0, estimate.unit)
         for name, estimate in method.estimates.items()})
-
-
-def ranked(improvements: list[TestedChange], before: Plan, parameter: str) -> list[TestedChange]:
-    """Return the changes that reduce the sigma of a parameter, best first."""
-    min_gain = 1 / 0.98    # a change with less is not listed
-    helpful = [change for change in improvements if change.gain(before, parameter) > min_gain]
-    return sorted(helpful, key=lambda change: (-change.gain(before, parameter),
-                                               change.sigmas[parameter]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +147,19 @@ class Planned(Plan):
     """The prediction of a drive by each method, with the drive and its errors and settings."""
 
     drive: PlannedDrive
-    sigmas: Sigmas
+    sigmas: Sigmas      # errors of the sensors, and settings
 
     @cached_property
     def improvements(self) -> list[TestedChange]:
-        """Return the computed improvements; this takes some seconds."""
-        return tested_changes(self.drive, self.sigmas, self)
+        """Return changes of the drive and its sensors; this takes some seconds."""
+        return _tested_changes(self)
+
+    def best_improvements(self, parameter: str) -> list[TestedChange]:
+        """Return the changes that reduce the sigma of a parameter by over 2 %, best first."""
+        gains = [(change.gain(self, parameter), change) for change in self.improvements]
+        helpful = [(gain, change) for gain, change in gains if gain > 1 / 0.98]
+        helpful.sort(key=lambda pair: (-pair[0], pair[1].sigmas[parameter]))
+        return [change for _, change in helpful]
 
     def to_dict(self) -> dict[str, Any]:
         """
@@ -206,9 +210,9 @@ def plan(*, distance: float | None = None, speed: float | None = None,
 
     Raises BadUsage, BadConfig: not exactly one drive is given, or its values are invalid.
     """
-    given = [name for name, value in {'scenario': scenario, 'gpx': gpx, 'bag': bag,
-                                      'distance': distance}.items() if value is not None]
-    _check_arguments(given, {'speed': speed, 'turns': turns, 'standstill': standstill,
+    drives = [name for name, value in {'scenario': scenario, 'gpx': gpx, 'bag': bag,
+                                       'distance': distance}.items() if value is not None]
+    _check_arguments(drives, {'speed': speed, 'turns': turns, 'standstill': standstill,
                              'acceleration': acceleration, 'duration': duration,
                              **{f'{slot}-topic': topic for slot, topic in (topics or {}).items()}})
     from odocal_ros.library.read_bag import journal_notes
@@ -234,21 +238,21 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     return Planned(**vars(plan_methods(drive, sigmas)), drive=drive, sigmas=sigmas)
 
 
-def _check_arguments(given: list[str], others: dict[str, Any]) -> None:
-    """Raise BadUsage if the arguments that give a drive are not one, or do not fit ``others``."""
-    if len(given) != 1:
+def _check_arguments(drives: list[str], others: dict[str, Any]) -> None:
+    """Raise BadUsage if not one drive is given, or if other arguments do not fit it."""
+    if len(drives) != 1:
         raise BadUsage('plan: give one drive: --scenario NAME, --gpx FILE, --bag BAG, or '
-                       f'--distance with --speed{"; not " if given else ""}'
-                       f'{" and ".join("--" + name for name in given)}')
+                       f'--distance with --speed{"; not " if drives else ""}'
+                       f'{" and ".join("--" + name for name in drives)}')
     required = {'speed': ('distance', 'gpx'), 'turns': ('distance',), 'standstill': ('distance',),
                 'acceleration': ('distance',), 'duration': ('scenario',)}
     for name, value in others.items():
-        drives = required.get(name, ('bag',))      # otherwise a topic
-        if value is not None and given[0] not in drives:
-            raise BadUsage(f'--{name} requires {" or ".join(f"--{drive}" for drive in drives)}, '
-                           f'not --{given[0]}')
+        fitting = required.get(name, ('bag',))      # otherwise a topic
+        if value is not None and drives[0] not in fitting:
+            raise BadUsage(f'--{name} requires {" or ".join(f"--{drive}" for drive in fitting)}, '
+                           f'not --{drives[0]}')
     speed = others['speed']
-    if speed is None and given == ['distance']:
+    if speed is None and drives == ['distance']:
         raise BadUsage('--distance requires --speed, m/s')
     if speed is not None and not (math.isfinite(speed) and speed > 0):
         raise BadUsage(f'--speed {speed:g}: required: a number above 0')

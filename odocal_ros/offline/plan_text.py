@@ -7,7 +7,7 @@ import math
 
 from odocal_ros.calib.number_text import significant
 from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE, WHITE_SIGMA_SHARE
-from odocal_ros.library.plan import Planned, ranked, SCALE, YAW
+from odocal_ros.library.plan import Planned, SCALE, YAW
 from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
 from odocal_ros.output import value_text as texts
 from odocal_ros.output.tables import budget_lines
@@ -116,7 +116,7 @@ def _budget_lines(plan: Plan) -> list[str]:
 def _improvement_lines(plan: Planned) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
-        best, label = ranked(plan.improvements, plan, parameter), texts.MAIN_VALUES[parameter]
+        best, label = plan.best_improvements(parameter), texts.MAIN_VALUES[parameter]
         lines.append(f'  largest improvements of the {label}' if best else
                      f'  no tested change improves the {label}')
         lines += [f'    {change.text:<58}{_sigma_text(parameter, plan.sigma(parameter)):>10} -> '

@@ -143,24 +143,21 @@ class SimOptions:
         return max(self.wheels, 1 + self.two_wheels)
 
 
-# values that depend on the scenario
-DEFAULTS = {
+# values of a scenario, if they are not COMMON_DEFAULTS
+ROBOT_RUN = {'reference': 'slam', 'wheels': 2, 'track_width': 0.3, 'imu_grade': 'consumer'}
+DEFAULTS: dict[str, dict[str, Any]] = {
     'paper': {'duration': 930.0, 'imu_grade': 'navigation', 'pitch': 0.0},
     'straight': {'duration': 720.0, 'imu_grade': 'industrial'},
-    'out_and_back': {'duration': 600.0, 'imu_grade': 'industrial'},
-    'town': {'duration': 600.0, 'imu_grade': 'consumer'},
-    'motorway': {'duration': 600.0, 'imu_grade': 'industrial'},
-    'oval': {'duration': 600.0, 'imu_grade': 'industrial'},
-    'yard': {'duration': 600.0, 'imu_grade': 'consumer'},
-    'indoor': {'duration': 150.0, 'imu_grade': 'consumer', 'reference': 'slam', 'wheels': 2,
-               'track_width': 0.3},
-    'square': {'duration': 151.0, 'imu_grade': 'consumer', 'reference': 'slam', 'wheels': 2,
-               'track_width': 0.3},
+    'out_and_back': {'imu_grade': 'industrial'}, 'town': {'imu_grade': 'consumer'},
+    'motorway': {'imu_grade': 'industrial'}, 'oval': {'imu_grade': 'industrial'},
+    'yard': {'imu_grade': 'consumer'},
+    'indoor': ROBOT_RUN | {'duration': 150.0}, 'square': ROBOT_RUN | {'duration': 151.0},
 }
 COMMON_DEFAULTS = {
-    'yaw': math.radians(1.0), 'pitch': math.radians(0.4), 'reference': 'fix', 'wheels': 1,
-    'track_width': 1.6, 'fix_rate': 5.0, 'fix_noise': 'white', 'fix_correlation_time': 60.0,
-    'reference_drift': 0.0, 'drift_length': 0.0, 'closure_time': 0.0,
+    'duration': 600.0, 'yaw': math.radians(1.0), 'pitch': math.radians(0.4), 'reference': 'fix',
+    'wheels': 1, 'track_width': 1.6, 'fix_rate': 5.0, 'fix_noise': 'white',
+    'fix_correlation_time': 60.0, 'reference_drift': 0.0, 'drift_length': 0.0,
+    'closure_time': 0.0,
 }
 ROBOTS = ('indoor', 'square')     # scenarios
 # (true, nominal) scale by kind of odometer, of a robot: 70 mm wheels, encoders with 2500 counts
