@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
-from datetime import datetime, UTC
+from datetime import datetime, timedelta, UTC
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,8 +66,8 @@ class LegSpan(NamedTuple):
 
 def paths_of(argument: Any) -> list[Path]:
     """Return the paths of one bag or several; BadUsage: there is none, or one is not a path."""
-    is_one = isinstance(argument, (str, Path)) or not isinstance(argument, Iterable)
-    paths = [argument] if is_one else list(argument)
+    is_single = isinstance(argument, (str, Path)) or not isinstance(argument, Iterable)
+    paths = [argument] if is_single else list(argument)
     if not paths:
         raise BadUsage('no bag is given; required: one path or several')
     for path in paths:
@@ -126,8 +126,8 @@ def legs_of(argument: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
         return []
     if not isinstance(argument, Iterable):
         raise BadUsage(f'legs: {argument!r}: {LEG_FORMS}')
-    is_one = isinstance(argument, str) or _is_pair(argument)
-    legs: Iterable[Any] = [argument] if is_one else argument
+    is_single = isinstance(argument, str) or _is_pair(argument)
+    legs: Iterable[Any] = [argument] if is_single else argument
     return [leg if leg == EACH_STOP else parse_leg(_leg_text(leg)) for leg in legs]
 
 
@@ -177,8 +177,8 @@ def _time_ns(text: str, leg: str) -> tuple[int | None, bool]:
         raise BadUsage(f'--leg {leg}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
                        'for seconds, A/B for dates') from None
     date = date if date.tzinfo else date.replace(tzinfo=UTC)
-    since = date - datetime(1970, 1, 1, tzinfo=UTC)
-    time_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
+    # in whole numbers: a float has no ns since 1970
+    time_ns = (date - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
     if abs(time_ns) >= LATEST_NS:
         raise BadUsage(f'--leg {leg}: {text} is out of range; the limit is the year 2116')
     return time_ns, False

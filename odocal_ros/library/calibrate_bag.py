@@ -54,9 +54,9 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     request = _Request(arguments.topics_of(topics), config, arguments.legs_of(legs), holdout)
     imu = known_imu(arguments.config_of(config))
     unique: dict[Path, Path] = {}
-    for given in arguments.paths_of(path):
-        if unique.setdefault(given.resolve(), given) is not given:
-            notes.note(f'{given} is given twice; it is read once')
+    for bag_path in arguments.paths_of(path):
+        if unique.setdefault(bag_path.resolve(), bag_path) is not bag_path:
+            notes.note(f'{bag_path} is given twice; it is read once')
     paths = list(unique.values())
     if len(paths) > 1:
         _check_bags(paths, request)
@@ -116,21 +116,21 @@ def _calibrate_bags(paths: list[Path], request: _Request,
                     listener: arguments.Listener) -> list[_BagLegs]:
     """Return the results of each bag; a journal whose leg was dropped is skipped, if not alone."""
     bags: list[_BagLegs] = []
-    dropped = None
+    drop_error = None
     for path in paths:
         try:
             unit = bags[0].unit if bags else None
             bags.append(_calibrate_one_bag(path, request, unit, listener))
         except LegDropped as error:
-            dropped = error
+            drop_error = error
             if len(paths) > 1:
                 listener.note(str(error))
         except OdocalError as error:
             if len(paths) == 1:
                 raise
             raise BadUsage(error_about(path, error)) from None
-    if dropped and not bags:
-        raise dropped
+    if drop_error and not bags:
+        raise drop_error
     return bags
 
 

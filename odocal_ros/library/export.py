@@ -139,11 +139,11 @@ def _topics(result: Calibration) -> list[encode.Topic]:
 
 def _residual_topics(result: Calibration) -> list[encode.Topic]:
     """Return a topic for each sensor, with its residuals in all legs."""
-    legs_of_sensor: dict[str, list[Any]] = {}
+    legs_of_sensor: dict[str, list[series.LegSeries]] = {}
     for number, leg in enumerate(result.legs, 1):
         for residual in series.sensor_residuals(leg):
             legs_of_sensor.setdefault(residual.sensor, []).append(
-                (number, leg, _component_columns(residual)))
+                series.LegSeries(number, leg, _component_columns(residual)))
     topics = []
     for sensor, legs in legs_of_sensor.items():
         rows = _by_time(series.stack_legs(legs))

@@ -9,6 +9,7 @@ standstills.
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -51,12 +52,9 @@ class Standstills(NamedTuple):
 
 def marked_legs(bag: Bag) -> list[tuple[int, int]]:
     """Return legs marked by a node, not cancelled; stop = 0: recording ended before the mark."""
-    legs = []
-    for values in last_statuses(bag):
-        start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
-        if values.get('leg_event') not in DROPPED_EVENTS and start > 0:
-            legs.append((start, stop))
-    return sorted(legs)
+    legs = [(int(values['leg_start_ns']), int(values['leg_stop_ns']))
+            for values in last_statuses(bag) if values.get('leg_event') not in DROPPED_EVENTS]
+    return sorted(leg for leg in legs if leg[0] > 0)
 
 
 def missing_stop_reasons(spans: Spans,
@@ -72,11 +70,13 @@ def coverage_reasons(recorder: LegRecorder) -> tuple[Reason, ...]:
     ends = _first_and_last(recorder)
     if not ends:
         return ()
-    begin, end = min(a for a, _ in ends.values()), max(b for _, b in ends.values())
+    firsts, lasts = zip(*ends.values(), strict=True)
+    earliest, latest = min(firsts), max(lasts)
     gaps = [f'{INPUTS[slot].label} {verb} {missing_ns * 1e-9:.0f} s {relation}'
-            for slot, (a, b) in ends.items()
-            for verb, missing_ns, relation in (('begins', a - begin, 'after the first topic'),
-                                               ('ends', end - b, 'before the last topic'))
+            for slot, (first, last) in ends.items()
+            for verb, missing_ns, relation in (
+                ('begins', first - earliest, 'after the first topic'),
+                ('ends', latest - last, 'before the last topic'))
             if missing_ns > COVERAGE_TOLERANCE_NS]
     return (Reason(Code.TOPIC_GAP, f'{", ".join(gaps)}: the leg is limited to the time '
                    'that all topics cover', 'Wait for messages of all topics and the first fix '
@@ -115,7 +115,7 @@ def _statuses(bag: Bag) -> Iterator[dict[str, str]]:
             for _, message in bag.messages(topic.name):
                 for status in message.status:
                     if status.name.endswith(STATUS_NAME):
-                        yield {kv.key: kv.value for kv in status.values}
+                        yield {entry.key: entry.value for entry in status.values}
 
 
 def find_legs(recorder: LegRecorder, bag: AnyBag, requested: Sequence[LegSpan | str],
@@ -124,10 +124,9 @@ def find_legs(recorder: LegRecorder, bag: AnyBag, requested: Sequence[LegSpan | 
     """
     Return (start, stop) stamps of the legs of one bag.
 
-    recorder : fed with the whole bag.   bag : for its time span.   requested : legs; empty: the
-    marks, else automatic legs with leg.automatic, else one between standstills.   marks :
-    (start, stop) by the node.   config : standstills, least distance.   stops : result of
-    ``standstills_of`` for the common time of the topics, if known.
+    recorder : with all rows of the bag.   bag : for its time span.   requested : legs; empty: the
+    marks, else automatic legs with leg.automatic, else one between standstills.   marks : (start,
+    stop) by the node.   stops : result of ``standstills_of`` for the common time of the topics.
 
     Raises BadUsage: a requested leg is outside the bag; BadData: the stamps of the topics have no
     common time, and a leg must be searched or is open-ended.
@@ -158,7 +157,7 @@ def find_legs(recorder: LegRecorder, bag: AnyBag, requested: Sequence[LegSpan | 
 
 def _marked_spans(marks: Sequence[tuple[int, int]], last: int, bag: AnyBag) -> Spans:
     """Return marked legs, each with an end."""
-    legs = [(a, b or last) for a, b in marks if (b or last) > a]
+    legs = [(start, stop or last) for start, stop in marks if (stop or last) > start]
     if not legs:
         raise BadData(f'{bag.name}: the recording ended at the start mark or right after it, so '
                       'the leg is empty; drive it again, or use the whole recording with --leg :')
@@ -167,11 +166,15 @@ def _marked_spans(marks: Sequence[tuple[int, int]], last: int, bag: AnyBag) -> S
 
 def _first_and_last(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
     """Return the first and the last stamp of each required slot that has stamps."""
-    rows = {slot: recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')}
-    stamps = {slot: s[s > 0] for slot, s in rows.items()}
-    # medians of five, not extremes: one implausible stamp must not move the leg
-    return {slot: (int(np.median(s[:5])), int(np.median(s[-5:]))) if len(s) > 20
-            else (int(s.min()), int(s.max())) for slot, s in stamps.items() if len(s)}
+    ends = {}
+    for slot in ('imu', 'odometer', 'fix'):
+        stamps = recorder.rows(slot).stamp_ns
+        stamps = stamps[stamps > 0]
+        if len(stamps) > 20:      # medians: one implausible stamp must not move the leg
+            ends[slot] = int(np.median(stamps[:5])), int(np.median(stamps[-5:]))
+        elif len(stamps):
+            ends[slot] = int(stamps.min()), int(stamps.max())
+    return ends
 
 
 def _no_common_time_text(recorder: LegRecorder) -> str:
@@ -218,7 +221,7 @@ def standstills_of(inputs: Inputs, first: int, config: Config) -> Standstills:
 
 
 def automatic_legs(recorder: LegRecorder, last: int, config: Config) -> Spans:
-    """Return the legs that the node would start and end automatically."""
+    """Return the legs that the node would start and end; ``last``: end of an open one, ns."""
     search = LegSearch(config)
     for slot in ('fix', 'imu', 'odometer'):
         search.feed(slot, recorder.rows(slot), recorder.form)
@@ -244,8 +247,7 @@ def _leg_between_standstills(first: int, last: int, stops: Standstills) -> tuple
 
 def _legs_between_all_stops(stops: Standstills, config: Config) -> Spans:
     """Return a leg from each standstill to the next, without short ones if others are left."""
-    starts, ends = stops.spans_ns[:-1, 1].tolist(), stops.spans_ns[1:, 1].tolist()
-    legs = list(zip(starts, ends, strict=True))
+    legs = list(pairwise(stops.spans_ns[:, 1].tolist()))
     lengths = stops.path_m[1:, 0] - stops.path_m[:-1, 1]
-    return [leg for leg, m in zip(legs, lengths, strict=True)
-            if m >= config.leg.min_distance] or legs
+    return [leg for leg, length in zip(legs, lengths, strict=True)
+            if length >= config.leg.min_distance] or legs

@@ -94,15 +94,15 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
 
 def robot_of(options: SimOptions) -> Robot:
     """Return robot and reference of a simulated drive."""
-    usual = dict(REFERENCES[options.reference].options)
-    drift, length = usual.get('reference_drift', 0.0), usual.get('drift_length', 0.0)
+    defaults = REFERENCES[options.reference].options
+    drift, length = defaults.get('reference_drift', 0.0), defaults.get('drift_length', 0.0)
     # the sigma of a correlated error; for a random walk that of the model with the same increments
     stationary = drift * np.sqrt((length or Robot.drift_length) / 2)
     straight = STRAIGHT_RATIO * options.track_width if options.drive == SKID else 0.0
     return Robot(drive=options.drive, imu=options.imu, width=effective_width(options),
                  straight_width=straight, wheels=max(options.wheels or 2, 2),
-                 slip=options.slip_walk, position_sigma=usual['fix_sigma'],
-                 position_rate=usual['fix_rate'], drift_sigma=float(stationary))
+                 slip=options.slip_walk, position_sigma=defaults['fix_sigma'],
+                 position_rate=defaults['fix_rate'], drift_sigma=float(stationary))
 
 
 def motion_of_drive(options: SimOptions) -> RobotMotion:
@@ -123,4 +123,4 @@ def ratio_sigma(method: MethodResult) -> float | None:
     a, b = (wheel.relative_sigma if wheel else None for wheel in (left, right))
     if a is None or b is None or rho is None:
         return None
-    return float(np.sqrt(a**2 + b**2 - 2 * rho * a * b))
+    return float(np.sqrt(a**2 + b**2 - 2 * rho * a * b))      # of a quotient, relative

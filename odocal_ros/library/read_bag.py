@@ -104,12 +104,12 @@ def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
                journal: JournalNotes | None, listener: arguments.Listener | None = None,
                ) -> tuple[dict[str, str], dict[str, Reader]]:
     """Return slot -> topic, and topic -> reader; ``topics`` take precedence over a journal's."""
-    from odocal_ros.library.topics import choose_topics, local_reference
+    from odocal_ros.library.topics import choose_topics, reference_note
     with_messages = {name for name, info in bag.topics.items() if info.count}
     requested = {slot: topic for slot, topic in (journal.topics if journal else {}).items()
                  if topic in with_messages} | dict(topics)
     mapping = choose_topics(bag.topics, config, requested, bool(floor_marks_of(config, bag)))
-    note = local_reference(bag.topics, mapping, requested)
+    note = reference_note(bag.topics, mapping, requested)
     if note and listener:
         listener.note(note)
     return mapping, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
@@ -200,13 +200,14 @@ def _stored_marks(bag: Bag, points: int) -> list[FloorMark]:
 def check_wheels_stand(marks: Sequence[FloorMark], recorder: LegRecorder, start_ns: int) -> None:
     """Raise BadUsage for a mark in motion or outside the bag, which begins at start_ns."""
     rows = recorder.rows('odometer')
-    t, value = (rows.stamp_ns - start_ns) * 1e-9, np.asarray(rows.value, dtype=float)
+    t, total = (rows.stamp_ns - start_ns) * 1e-9, np.asarray(rows.value, dtype=float)
     if recorder.form.quantity != 'cumulative':
-        value = np.cumsum(value)
+        total = np.cumsum(total)
 
     def travel_around(times: Floats) -> Floats:
+        """Return the travel within HALF_MARK s before and after each time, raw units."""
         begin, end = times - HALF_MARK, times + HALF_MARK
-        travel: Floats = np.interp(end, t, value) - np.interp(begin, t, value)
+        travel: Floats = np.interp(end, t, total) - np.interp(begin, t, total)
         return np.abs(travel)
     times = np.array([(mark.stamp_ns - start_ns) * 1e-9 for mark in marks])
     for time in times.tolist():

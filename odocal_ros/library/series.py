@@ -5,7 +5,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,21 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.nav.dead_reckoning import forward_b, Origin
 from odocal_ros.nav.rotations import quat_from_matrix, rpy_from_matrix
 
-Series = dict[str, NDArray[Any]]
+Series = dict[str, NDArray[Any]]    # columns of equal length, by name
 NO_FIT = ('no leg has a result of the smoother, which computes this series; see the reasons, or '
           'use method auto')
-# residuals of the smoother: sensor, unit, components
-SMOOTHER_SENSORS = (
-    ('fix', 'm', ('east', 'north', 'up')), ('odometer', 'm', ('along', 'left', 'up')),
-    ('gyro', 'rad/s', ('x', 'y', 'z')), ('accelerometer', 'm/s^2', ('x', 'y', 'z')))
+# residuals of the smoother: sensor -> unit, components
+SMOOTHER_SENSORS = {
+    'fix': ('m', ('east', 'north', 'up')), 'odometer': ('m', ('along', 'left', 'up')),
+    'gyro': ('rad/s', ('x', 'y', 'z')), 'accelerometer': ('m/s^2', ('x', 'y', 'z'))}
+
+
+class LegSeries(NamedTuple):
+    """The series of a leg."""
+
+    number: int         # of the leg, from 1
+    leg: LegResult
+    columns: Series     # with the times t, s since the start mark
 
 
 def trajectory(result: Calibration) -> Series:
@@ -49,9 +57,9 @@ def states(result: Calibration) -> Series:
 
 
 def _stack_fits(result: Calibration,
-                columns: Callable[[LegResult, dict[str, Any]], Series]) -> Series:
-    """Return the columns of all legs with a fit of the smoother; columns: of leg and details."""
-    legs = [(number, leg, columns(leg, leg.methods['smoother'].details))
+                make_columns: Callable[[LegResult, dict[str, Any]], Series]) -> Series:
+    """Return the columns of all legs with a fit of the smoother, from leg and its details."""
+    legs = [LegSeries(number, leg, make_columns(leg, leg.methods['smoother'].details))
             for number, leg in enumerate(result.legs, 1)
             if leg.track_n is not None
             and 'key_C_nb' in getattr(leg.methods.get('smoother'), 'details', ())]
@@ -76,6 +84,7 @@ def _vehicle_attitude(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
 
 
 def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
+    """Return the columns of ``trajectory``."""
     track_n = smoothed['track_n']
     # a local frame has no position on the Earth
     geodetic = Origin(*leg.origin).to_geodetic(track_n) if leg.origin else np.full(
@@ -90,6 +99,7 @@ def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
 
 
 def _state(leg: LegResult, smoothed: dict[str, Any]) -> Series:
+    """Return the columns of ``states``."""
     angles = rpy_from_matrix(_vehicle_attitude(leg, smoothed))
     columns = {'t': smoothed['track_t'],
                **dict(zip(('roll', 'pitch', 'yaw'), np.transpose(angles), strict=True))}
@@ -100,27 +110,27 @@ def _state(leg: LegResult, smoothed: dict[str, Any]) -> Series:
     return columns
 
 
-def stack_legs(legs: list[tuple[int, LegResult, Series]]) -> Series:
-    """Return the concatenated series of (number, leg, columns), with times and stamps."""
-    series = [{'leg': np.full(len(columns['t']), number),
-               'stamp_ns': leg.start_ns + np.round(columns['t'] * 1e9).astype(np.int64),
-               't_s': columns['t'],
-               **{name: column for name, column in columns.items() if name != 't'}}
-              for number, leg, columns in legs]
-    return {name: np.concatenate([leg_series[name] for leg_series in series])
-            for name in series[0]}
+def stack_legs(legs: list[LegSeries]) -> Series:
+    """Return the series of legs one after another, with numbers, stamps and times."""
+    series = []
+    for number, leg, columns in legs:
+        t = columns['t']
+        stamp_ns = leg.start_ns + np.round(t * 1e9).astype(np.int64)
+        series.append({'leg': np.full(len(t), number), 'stamp_ns': stamp_ns, 't_s': t} | columns)
+    return {name: np.concatenate([columns[name] for columns in series])
+            for name in series[0] if name != 't'}
 
 
 @dataclass(frozen=True, eq=False)
 class SensorResiduals:
-    """Residuals of a sensor in a leg: t (m,) s, value and sigma (m, c), NaN: none."""
+    """Residuals of a sensor with c components in a leg."""
 
     sensor: str
     unit: str
     components: tuple[str, ...]
-    t: NDArray[np.float64]
-    value: NDArray[np.floating]
-    sigma: NDArray[np.floating]
+    t: NDArray[np.float64]           # (m,) s since the start mark
+    value: NDArray[np.floating]      # (m, c)
+    sigma: NDArray[np.floating]      # (m, c), NaN: no residual
 
 
 def sensor_residuals(leg: LegResult) -> list[SensorResiduals]:
@@ -132,7 +142,7 @@ def sensor_residuals(leg: LegResult) -> list[SensorResiduals]:
                    for name, rows in (('track', evidence.residual),
                                       ('track_before', evidence.residual_before))]
     smoothed = getattr(leg.methods.get('smoother'), 'details', {})
-    for sensor, unit, components in SMOOTHER_SENSORS:
+    for sensor, (unit, components) in SMOOTHER_SENSORS.items():
         if f'residual_{sensor}' in smoothed:      # residuals, then their sigmas
             t = smoothed['residual_fix_t'] if sensor == 'fix' else smoothed['key_t'][1:]
             sensors.append(SensorResiduals(sensor, unit, components, t,
@@ -154,8 +164,8 @@ def residuals(result: Calibration) -> Series:
 
     Raises BadUsage: no leg has a track.
     """
-    legs = [(number, leg, _residual_rows(leg, of_sensor))
-            for number, leg in enumerate(result.legs, 1) for of_sensor in sensor_residuals(leg)]
+    legs = [LegSeries(number, leg, _residual_rows(leg, sensor)) for number, leg in enumerate(
+        result.legs, 1) for sensor in sensor_residuals(leg)]
     if not legs:
         raise BadUsage('no leg has a track to compare with its fixes; see the reasons')
     return stack_legs(legs)

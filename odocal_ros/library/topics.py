@@ -20,7 +20,7 @@ from odocal_ros.messages.message_fields import (
 )
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.safe_io.text_formats import indented_list, one_line
-from odocal_ros.settings.config import Config, OdometerConfig
+from odocal_ros.settings.config import Config, OdometerConfig, SIDES
 
 SYSTEM_TOPICS = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
 COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # sent to a vehicle, not measured
@@ -45,12 +45,12 @@ Topics = dict[str, TopicInfo]
 
 
 def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
-                  marked: bool = False) -> dict[str, str]:
+                  has_marks: bool = False) -> dict[str, str]:
     """
     Return slot -> topic.
 
     topics : by name.   config : required inputs, and the type of the odometer.   overrides :
-    slot -> topic, by the user.   marked : marks on surveyed points replace fixes.
+    slot -> topic, by the user.   has_marks : marks on surveyed points replace fixes.
 
     Raises BadUsage: a named topic is missing, or a required input is not unique: none or several
     fit. All such inputs are named at once, with the option that selects each. BadTopics lists
@@ -58,30 +58,30 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     """
     mapping = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(mapping)
-    if marked and 'fix' in mapping:
+    if has_marks and 'fix' in mapping:
         raise BadUsage(f'--fix-topic {mapping["fix"]}: reference.marks is set, so fixes '
                        'are not used; omit --fix-topic or reference.marks')
     errors: list[str] = []
-    for slot in required_slots(config, marked):
+    for slot in required_slots(config, has_marks):
         if slot in mapping:
             continue
-        fitting = candidates(topics, slot, config, mapping)
-        if len(fitting) == 1:
-            mapping[slot] = fitting[0]
-        elif not _is_optional(slot, config, fitting):
-            errors.append(_unfilled_slot_text(topics, slot, fitting, config, mapping))
+        names = candidates(topics, slot, config, mapping)
+        if len(names) == 1:
+            mapping[slot] = names[0]
+        elif not _is_optional(slot, config, names):
+            errors.append(_missing_topic_text(topics, slot, names, config, mapping))
     if errors:
         if not all('; choose one with ' in text for text in errors):
-            errors.append(f'the bag has:{_described(topics, topics)}')
+            errors.append(f'the bag has:{_describe_topics(topics, topics)}')
         raise BadTopics(';\n'.join(errors))
     return mapping
 
 
-def required_slots(config: Config, marked: bool = False) -> tuple[str, ...]:
+def required_slots(config: Config, has_marks: bool = False) -> tuple[str, ...]:
     """Return the slots to fill, in order."""
-    surveyed = config.reference.start and config.reference.end or (
-        config.reference.marks or marked)
-    slots = [slot for slot in config.inputs if not (slot == 'fix' and surveyed)]
+    reference = config.reference
+    has_surveyed_ends = (reference.start and reference.end) or reference.marks or has_marks
+    slots = [slot for slot in config.inputs if not (slot == 'fix' and has_surveyed_ends)]
     return (*(slot for slot in CHOSEN_FIRST if slot in slots),
             *(slot for slot in slots if slot not in CHOSEN_FIRST))
 
@@ -89,33 +89,32 @@ def required_slots(config: Config, marked: bool = False) -> tuple[str, ...]:
 def candidates(topics: Topics, slot: str, config: Config, mapping: dict[str, str]) -> list[str]:
     """Return the topics that fit a slot and are not chosen for another."""
     types = _types(slot, config)
-    taken = set(mapping.values())
-    fitting = [t.name for t in topics.values()
-             if t.count and t.msgtype in types and t.name not in taken
-             and t.name not in SYSTEM_TOPICS and '/calibrator/' not in t.name]
+    used_topics = set(mapping.values())
+    names = [topic.name for topic in topics.values()
+             if topic.count and topic.msgtype in types and topic.name not in used_topics
+             and topic.name not in SYSTEM_TOPICS and '/calibrator/' not in topic.name]
     if slot in ('odometer', 'odometer_right'):
-        fitting = [name for name in fitting if not _contains(name, COMMANDS)]
-        fitting = without_estimates(fitting)
+        names = without_estimates([name for name in names if not _contains(name, COMMANDS)])
         if config.odometer.has_two_topics:
-            fitting = [name for name in fitting if ('right' in name) == (slot != 'odometer')]
+            names = [name for name in names if ('right' in name) == (slot != 'odometer')]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name of the node's input
-            return [name for name in fitting if _base_name(name) == 'heading']
+            return [name for name in names if _base_name(name) == 'heading']
         # a single topic with an orientation is the IMU
-        is_imu = len(fitting) == 1 and 'imu' not in mapping
-        fitting = [name for name in fitting if 'heading' in name] or ([] if is_imu else fitting)
+        is_imu = len(names) == 1 and 'imu' not in mapping
+        names = [name for name in names if 'heading' in name] or ([] if is_imu else names)
     elif slot == 'imu':
-        fitting = _preferably_without(fitting, ('heading',))
+        names = _prefer_without(names, ('heading',))
     elif slot == 'fix':
-        fixes = [name for name in fitting if topics[name].msgtype in GEODETIC]
-        fitting = [name for name in fixes if topics[name].msgtype == FIX] or fixes or [
-            name for name in fitting if not _contains(name, (*COMMANDS, *GOALS))]
-        fitting = _preferably_without(fitting, ('filtered', 'fused'))
+        fixes = [name for name in names if topics[name].msgtype in GEODETIC]
+        names = [name for name in fixes if topics[name].msgtype == FIX] or fixes or [
+            name for name in names if not _contains(name, (*COMMANDS, *GOALS))]
+        names = _prefer_without(names, ('filtered', 'fused'))
     elif slot == 'fix_velocity':
-        fitting = [name for name in fitting if _is_of_receiver(name)]
+        names = [name for name in names if _is_of_receiver(name)]
         # by the name of the node's input
-        fitting = [name for name in fitting if _base_name(name) == slot] or fitting
-    return fitting
+        names = [name for name in names if _base_name(name) == slot] or names
+    return names
 
 
 def without_estimates(names: list[str]) -> list[str]:
@@ -132,7 +131,7 @@ def _check_reference(mapping: dict[str, str]) -> None:
                            'itself; name another topic for one of them')
 
 
-def local_reference(topics: Topics, mapping: dict[str, str], overrides: dict[str, str]) -> str:
+def reference_note(topics: Topics, mapping: dict[str, str], overrides: dict[str, str]) -> str:
     """Return the note that poses are the reference if the user did not name them, or ''."""
     fix = mapping.get('fix', '')
     if not fix or 'fix' in overrides or topics[fix].msgtype in GEODETIC:
@@ -141,10 +140,10 @@ def local_reference(topics: Topics, mapping: dict[str, str], overrides: dict[str
             f'({topics[fix].msgtype}); another one: {topic_option("fix")}')
 
 
-def _is_optional(slot: str, config: Config, fitting: list[str]) -> bool:
-    """Return True if a leg does not need a slot whose topic is missing or ambiguous."""
+def _is_optional(slot: str, config: Config, names: list[str]) -> bool:
+    """Return True if a leg does not need a slot; names : topics that fit it, none or several."""
     if slot == 'imu':
-        return not fitting and not config.odometer.needs_imu
+        return not names and not config.odometer.needs_imu
     return slot in EXTERNAL_SLOTS and not (
         slot == 'heading' and config.alignment.heading_source == 'heading_topic')
 
@@ -177,37 +176,36 @@ def resolve_topic(topics: Topics, slot: str, topic: str) -> str:
     else:
         return name
     raise BadTopics(f'{topic_option(slot)} {one_line(topic)}: {problem}; the bag has:'
-                    f'{_described(topics, topics)}')
+                    f'{_describe_topics(topics, topics)}')
 
 
 def topics_without_messages(types: Mapping[str, tuple[str, int]], slot: str) -> list[str]:
-    """Return the names of topics of a slot's type without messages; types : type and count."""
+    """Return the topics of a slot's type without messages; types : topic -> (type, count)."""
     msgtype = {'imu': IMU, 'fix': FIX}.get(slot)      # other types have more uses than one
     return [name for name, (found_type, count) in types.items()
             if found_type == msgtype and not count]
 
 
 def _fits_slot(msgtype: str, slot: str) -> bool:
-    """Return True if a type fits a slot; odometers can have a foreign type."""
+    """Return True if a type fits a slot; an odometer can have any other type."""
     if slot in ('odometer', 'odometer_right'):
         return full_type(msgtype) not in (IMU, *GEODETIC)
     return full_type(msgtype) in types_of(slot, OdometerConfig())
 
 
-def _unfilled_slot_text(topics: Topics, slot: str, fitting: list[str], config: Config,
+def _missing_topic_text(topics: Topics, slot: str, names: list[str], config: Config,
                         mapping: dict[str, str]) -> str:
-    """Return the reason for a slot without topic, and the option that selects one."""
+    """Return why no or several topics, ``names``, fit a slot, and the option that selects one."""
     fix = mapping.get('fix', '')
-    if slot == 'odometer' and fix and not fitting and topics[fix].msgtype in ODOMETERS:
+    if slot == 'odometer' and fix and not names and topics[fix].msgtype in ODOMETERS:
         return (f'no odometer in the bag besides {fix}, which is the position reference '
                 f'({topic_option("fix")}): an odometer cannot be calibrated against itself')
-    if fitting:
-        hint = ''
-        if slot == 'odometer' and {'left', 'right'} <= {
-                side for name in fitting for side in ('left', 'right') if side in name}:
-            hint = ', or for two wheels set odometer.left and odometer.right to topic'
-        return (f'{len(fitting)} topics can be the {INPUTS[slot].label}; choose one with '
-                f'{topic_option(slot)}{hint}:{_described(topics, fitting)}')
+    if names:
+        has_sides = all(any(side in name for name in names) for side in SIDES)
+        hint = (', or for two wheels set odometer.left and odometer.right to topic'
+                if slot == 'odometer' and has_sides else '')
+        return (f'{len(names)} topics can be the {INPUTS[slot].label}; choose one with '
+                f'{topic_option(slot)}{hint}:{_describe_topics(topics, names)}')
     types = tuple(_types(slot, config))
     empty = topics_without_messages({t.name: (t.msgtype, t.count) for t in topics.values()}, slot)
     if empty:
@@ -216,13 +214,13 @@ def _unfilled_slot_text(topics: Topics, slot: str, fitting: list[str], config: C
         return (f'no {INPUTS[slot].label} (a topic of {", ".join(types[:-1])} or {types[-1]}) in '
                 f'the bag; name a {TRANSFORMS} or nav_msgs/msg/Odometry with {topic_option(slot)}')
     allowed = ' or '.join(types) if len(types) < 3 else 'counts, angles or speeds'
-    used = [topic for topic in mapping.values() if topics[topic].msgtype in types]
-    except_for = ' besides the IMU' if slot == 'heading' else (
-        f' besides {", ".join(used)}' if used else '')
-    return f'no {INPUTS[slot].label} (a topic of {allowed}{except_for}) in the bag'
+    others = ', '.join(topic for topic in mapping.values() if topics[topic].msgtype in types)
+    others = 'the IMU' if slot == 'heading' else others
+    besides = f' besides {others}' if others else ''
+    return f'no {INPUTS[slot].label} (a topic of {allowed}{besides}) in the bag'
 
 
-def _described(topics: Topics, names: Iterable[str]) -> str:
+def _describe_topics(topics: Topics, names: Iterable[str]) -> str:
     """Return the topics that have messages, with their types, as a list."""
     return indented_list([f'{name} ({topics[name].msgtype})' for name in names
                           if topics[name].count and name not in SYSTEM_TOPICS]
@@ -239,6 +237,6 @@ def _contains(name: str, words: Iterable[str]) -> bool:
     return any(word in name.lower() for word in words)
 
 
-def _preferably_without(fitting: list[str], words: Iterable[str]) -> list[str]:
+def _prefer_without(fitting: list[str], words: Iterable[str]) -> list[str]:
     """Return the topics without such a word in their name; all, if none are left."""
     return [name for name in fitting if not _contains(name, words)] or fitting

@@ -128,7 +128,7 @@ class RealEffects:
 
     def __post_init__(self) -> None:
         for parameter in fields(self):
-            value = _checked(parameter, getattr(self, parameter.name))
+            value = _check(parameter, getattr(self, parameter.name))
             object.__setattr__(self, parameter.name, value)
 
     def matrix(self, name: str) -> Floats:
@@ -136,60 +136,50 @@ class RealEffects:
         return np.reshape(getattr(self, name), (3, 3))
 
 
-def _checked(parameter: Field[Any], value: Any) -> Any:
+def _check(parameter: Field[Any], value: Any) -> Any:
     """Return a parameter as numbers and tuples of them, or raise BadUsage."""
-    name, default = parameter.name, parameter.default
-    if name in CHOICES:
-        if value not in CHOICES[name] and value != default:
-            raise BadUsage(f'--real {name}={value}: required: one of {", ".join(CHOICES[name])}')
+    default, metadata = parameter.default, parameter.metadata
+
+    def require(is_valid: bool, requirement: str) -> None:
+        if not is_valid:
+            raise BadUsage(f'--real {parameter.name}={value}: required: {requirement}')
+    choices = CHOICES.get(parameter.name, ())
+    if choices or (value is None and default is None):
+        require(value in (*choices, default), f'one of {", ".join(choices)}')
         return value
-    if value is None and default is None:
-        return None
     if isinstance(value, list | tuple):       # lists: as read from YAML
         value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
-    numbers = _numbers(parameter, value)
-    if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
-        raise BadUsage(f'--real {name}={value}: required: finite numbers')
+    numbers = value if isinstance(value, tuple) else (value,)
+    if PAIRS in metadata:
+        first, second, example = metadata[PAIRS]
+        require(value is numbers and all(isinstance(v, tuple) and len(v) == 2 for v in value),
+                f'pairs of {first} and {second}, such as {example}')
+        require(all(v[1] for v in value), f'a {second} above 0')
+        numbers = tuple(x for pair in value for x in pair)
+    elif default is None or isinstance(default, tuple):
+        count = len(default or ZEROS3)
+        require(value is numbers and len(value) == count,
+                f'{count} numbers, such as ({"0," * (count - 1)}0.01)')
+    else:
+        require(value is not numbers, 'one number')
+    require(all(isinstance(x, int | float) and math.isfinite(x) for x in numbers),
+            'finite numbers')
     smallest = min(numbers, default=1.0)      # without pairs there is no number
-    is_valid, requirement = smallest >= 0 or SIGNED in parameter.metadata, '0 or more'
-    if name == 'drops':
-        is_valid, requirement = 0 <= smallest < 1, '0 or more, below 1'
-    elif name == 'imu_batch':
-        is_valid, requirement = smallest >= 1 and smallest % 1 == 0, 'a whole number, 1 or more'
-    elif POSITIVE in parameter.metadata:
-        is_valid, requirement = smallest > 0, POSITIVE
-    if not is_valid:
-        raise BadUsage(f'--real {name}={value}: required: {requirement}')
-    return value
-
-
-def _numbers(parameter: Field[Any], value: Any) -> tuple[Any, ...]:
-    """Return the numbers of a parameter, or raise BadUsage for a wrong form."""
-    name, default = parameter.name, parameter.default
-    if PAIRS in parameter.metadata:
-        first, second, example = parameter.metadata[PAIRS]
-        if not (isinstance(value, tuple)
-                and all(isinstance(v, tuple) and len(v) == 2 for v in value)):
-            raise BadUsage(f'--real {name}: required: pairs of {first} and {second}, such as '
-                           f'{example}')
-        if not all(v[1] for v in value):
-            raise BadUsage(f'--real {name}: the {second} is 0; required: above 0')
-        return tuple(x for pair in value for x in pair)
-    if default is not None and not isinstance(default, tuple):
-        if isinstance(value, tuple):
-            raise BadUsage(f'--real {name}: required: one number')
-        return (value,)
-    count = len(default or ZEROS3)
-    if not isinstance(value, tuple) or len(value) != count:
-        raise BadUsage(f'--real {name}: required: {count} numbers, such as '
-                       f'({"0," * (count - 1)}0.01)')
+    if parameter.name == 'drops':
+        require(0 <= smallest < 1, '0 or more, below 1')
+    elif parameter.name == 'imu_batch':
+        require(smallest >= 1 and smallest % 1 == 0, 'a whole number, 1 or more')
+    elif POSITIVE in metadata:
+        require(smallest > 0, POSITIVE)
+    else:
+        require(smallest >= 0 or SIGNED in metadata, '0 or more')
     return value
 
 
 def parse_parameter(text: str) -> tuple[str, Any]:
     """Return name and value of ``NAME=VALUE``; raise BadUsage for an unknown name."""
     name, _, value = text.partition('=')
-    names = [f.name for f in fields(RealEffects)]
+    names = [parameter.name for parameter in fields(RealEffects)]
     if name not in names:
         similar = difflib.get_close_matches(name, names, 3) or names
         raise BadUsage(f'--real {name}: no such parameter; similar: {", ".join(similar)}')

@@ -7,7 +7,7 @@ import pytest
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.topics import choose_topics, local_reference
+from odocal_ros.library.topics import choose_topics, reference_note
 from odocal_ros.offline.suggest import likely_mapping
 from odocal_ros.settings.config import Config, with_settings
 
@@ -159,10 +159,10 @@ def test_a_pose_is_the_reference_where_there_is_no_fix(kind):
     found = topics(fix=None, slam__pose=kind)
     chosen = choose(found)
     assert chosen['fix'] == '/slam/pose'
-    assert local_reference(found, chosen, {}) == (
+    assert reference_note(found, chosen, {}) == (
         f'no NavSatFix with messages in the bag; position reference: /slam/pose ({kind}); another '
         'one: --fix-topic')
-    assert local_reference(found, chosen, {'fix': '/slam/pose'}) == ''
+    assert reference_note(found, chosen, {'fix': '/slam/pose'}) == ''
     assert choose(topics(slam__pose=kind))['fix'] == '/fix'
     assert choose(topics(slam__pose=kind), {'fix': 'slam/pose'})['fix'] == '/slam/pose'
     unused = topics(slam__pose=kind) | {'/fix': TopicInfo('/fix', FIX, 0)}

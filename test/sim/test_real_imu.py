@@ -116,8 +116,8 @@ def test_late_stamps_do_not_move_the_true_marks():
     ({'speed_rounding': 'up'}, 'required: one of floor, round'), ({'drops': 1.0}, 'below 1'),
     ({'configured_grade': 'best'}, 'required: one of consumer'),
     ({'slow_errors': (1, 60)}, 'required: pairs'),
-    ({'slow_errors': ((1, 0),)}, 'slow_errors: the correlation time is 0; required: above 0'),
-    ({'tunnels': ((200, 0),)}, 'tunnels: the length is 0; required: above 0'),
+    ({'slow_errors': ((1, 0),)}, 'required: a correlation time above 0'),
+    ({'tunnels': ((200, 0),)}, 'required: a length above 0'),
     ({'warm_time': 0.0}, 'required: above 0'), ({'squat': float('nan')}, 'required: finite'),
     ({'imu_batch': 1.5}, 'a whole number, 1 or more')])
 def test_impossible_options_are_refused(figures, message):
