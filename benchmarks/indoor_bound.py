@@ -25,13 +25,15 @@ VALUES = {'scale': 'scale_factor', 'width': 'track_width', 'lever': 'rotation_le
 
 def forecast(seed):
     """Return the forecast sigma of each value of a run, relative or rad, None: not determined."""
+    from drives import robot_motion
+
     from odocal_ros.forecast.planned_indoor import predict_robot
-    from odocal_ros.library.plan_indoor import motion_of_drive, ratio_sigma, robot_of
+    from odocal_ros.library.plan_indoor import ratio_sigma, robot_of
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.options import resolve
     options = resolve(indoor.options_of(seed))
     config = with_settings(Config(), {'imu.grade': options.imu_grade})
-    found = predict_robot(motion_of_drive(options), robot_of(options), config)
+    found = predict_robot(robot_motion(options), robot_of(options), config)
     sigma = {key: None if (one := found.estimates.get(name)) is None or one.value is None
              else one.sigma / (one.value if one.unit != 'rad' else 1.0)
              for key, name in VALUES.items()}

@@ -11,11 +11,12 @@ import numpy as np
 
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.forecast.planned_drive import drive_from_rates
+from odocal_ros.forecast.robot_motion import MOTION_STEP, RobotMotion
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.pipeline.calibrate import calibrate
-from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.sim.scenarios import SimOptions, simulate
+from odocal_ros.settings.config import Config, HOLONOMIC, with_settings
+from odocal_ros.sim.scenarios import motion_of, SimOptions, simulate
 from odocal_ros.sim.truth import operator_settings
 
 ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')
@@ -189,3 +190,12 @@ def turned(imu, at_ns, turn):
     angle = np.outer(since**2 * (3 - 2 * since), turn)
     w, f = (np.einsum('kji,kj->ki', exp_so3(angle), x) for x in (imu.w_i, imu.f_i))
     return replace(imu, w_i=w + np.outer(6 * since * (1 - since), turn), f_i=f)
+
+
+def robot_motion(options):
+    """Return the motion of a simulated drive as that of a planned run, without rests."""
+    simulated = motion_of(options)
+    t = MOTION_STEP * np.arange(int(simulated.duration / MOTION_STEP) + 1)
+    state = simulated.at(t)
+    side_speed = state.sway[:, 0] * (options.drive in HOLONOMIC)
+    return RobotMotion(t, state.speed, side_speed, state.yaw_rate, np.empty((0, 2)))

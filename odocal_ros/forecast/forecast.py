@@ -165,10 +165,20 @@ def _combine_parameter(earlier: ParameterForecast, newest: ParameterForecast) ->
 
 def status_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str | float]:
     """Return the keys of ``~/status`` on a forecast; age_s : of its newest sample."""
-    keys = _running_keys(forecast, age_s)
-    for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
-        parameter = ParameterForecast(None, 0.0, None) if forecast is None else (
-            getattr(forecast, name))
+    if forecast is None:
+        unknown = ParameterForecast(None, 0.0, None)
+        forecast, age_s = Forecast(unknown, unknown), math.nan
+    keys: dict[str, str | float] = {'estimate_age_s': age_s}
+    methods = []
+    for name, unit in RUNNING_UNITS.items():
+        estimate = forecast.estimates.get(name, Estimate(None, None, ''))
+        known = estimate.value is not None
+        methods += [estimate.method] * known
+        for suffix, value in (('', estimate.value), ('_sigma', estimate.sigma if known else None)):
+            keys[f'estimate_{name}{suffix}{unit}'] = math.nan if value is None else value
+    keys['estimate_method'] = ', '.join(dict.fromkeys(methods))
+    for name, parameter, unit, factor in (('scale', forecast.scale, 'ppm', 1e6),
+                                          ('yaw', forecast.yaw, 'deg', math.degrees(1))):
         sigma, metres = parameter.sigma, parameter.remaining_m
         keys |= {
             f'predicted_{name}_sigma_{unit}': '' if sigma is None else sigma * factor,
@@ -177,21 +187,6 @@ def status_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str,
             f'predicted_{name}_sources_{unit}': ', '.join(
                 f'{source} {three_digits(size * factor)}' for source, size in parameter.sources)}
     return keys
-
-
-def _running_keys(forecast: Forecast | None, age_s: float) -> dict[str, str | float]:
-    """Return the keys of the running estimate, NaN if it is not determined."""
-    estimates = {} if forecast is None else forecast.estimates
-    keys: dict[str, str | float] = {}
-    methods = []
-    for name, unit in RUNNING_UNITS.items():
-        estimate = estimates.get(name, Estimate(None, None, ''))
-        known = estimate.value is not None
-        methods += [estimate.method] * known
-        for suffix, value in (('', estimate.value), ('_sigma', estimate.sigma if known else None)):
-            keys[f'estimate_{name}{suffix}{unit}'] = math.nan if value is None else value
-    return keys | {'estimate_method': ', '.join(dict.fromkeys(methods)),
-                   'estimate_age_s': math.nan if forecast is None else age_s}
 
 
 def _rounded_up(metres: float) -> int:

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Progress of a drive for the operator: distance, speed, standstill, clocks that differ.
-
-In: the blocks of rows that the node receives, in order of arrival.
-"""
+"""Progress of a drive, from received blocks: distance, speed, standstill, differing clocks."""
 
 from collections import deque
 from typing import Any

@@ -240,11 +240,6 @@ def check_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: 
     return _check_sigmas(sigmas, config) | dict.fromkeys(unusable, NO)
 
 
-def limit_keys(ok: dict[str, str]) -> dict[str, str]:
-    """Return the keys of ``~/status`` on limits, such as ``yaw_ok``: yes, no or unknown."""
-    return {f'{name}_ok': value for name, value in ok.items()}
-
-
 def quantities_text(ok: dict[str, str]) -> str:
     """Return the quantities that are OK, and those that are not, as text; empty: all unknown."""
     labels = {text: ', '.join(QUANTITIES[name].label for name, value in ok.items()

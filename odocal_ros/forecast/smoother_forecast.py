@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Forecast from the running estimate of the smoother, or from the planar estimator.
-
-``leg_forecast.py`` uses the functions for the smoother; the node calls ``planar_forecast``.
-"""
+"""Forecast from the running estimate of the smoother, or from the planar estimator."""
 
 from collections.abc import Callable
 from dataclasses import replace

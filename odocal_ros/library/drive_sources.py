@@ -6,7 +6,7 @@
 from datetime import datetime, UTC
 import math
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -120,8 +120,8 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
                        f'{max_points:,}. Export a track, not waypoints')
     try:
         lat_lon_deg = [[float(p.get(name, 'nan')) for name in ('lat', 'lon')] for p in points]
-        heights = np.array([float(_child(p, 'ele') or 'nan') for p in points])
-        times = [_seconds(_child(p, 'time')) for p in points]
+        heights = np.array([float(p.findtext('{*}ele') or 'nan') for p in points])
+        times = [_seconds(p.findtext('{*}time')) for p in points]
     except ValueError as error:
         raise BadUsage(f'{path}: a track point is not readable ({error}); export '
                        'the track again as GPX') from None
@@ -134,11 +134,6 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
         if known.any() else np.zeros(len(heights))
     return (None if None in times else np.array(times) - times[0],
             np.stack([lat, lon, heights], -1))
-
-
-def _child(point: Any, name: str) -> str | None:
-    """Return the text of the first child of an element with a name, None without one."""
-    return next((child.text for child in point if child.tag.rpartition('}')[2] == name), None)
 
 
 def _seconds(text: str | None) -> float | None:

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage, unknown_name
 from odocal_ros.forecast.planned_indoor import predict_robot, Robot
-from odocal_ros.forecast.robot_motion import MOTION_STEP, pattern_motion, PATTERNS, RobotMotion
+from odocal_ros.forecast.robot_motion import pattern_motion, PATTERNS, RobotMotion
 from odocal_ros.library.arguments import config_of, Settings
-from odocal_ros.settings.config import DRIVES, HOLONOMIC, SIDES, SKID
+from odocal_ros.settings.config import DRIVES, SIDES, SKID
 from odocal_ros.sim.options import REFERENCES, SimOptions
-from odocal_ros.sim.scenarios import motion_of
 from odocal_ros.sim.wheels import effective_width, STRAIGHT_RATIO
 
 MARKS = 'marks'
@@ -103,15 +101,6 @@ def robot_of(options: SimOptions) -> Robot:
                  straight_width=straight, wheels=max(options.wheels or 2, 2),
                  slip=options.slip_walk, position_sigma=defaults['fix_sigma'],
                  position_rate=defaults['fix_rate'], drift_sigma=float(stationary))
-
-
-def motion_of_drive(options: SimOptions) -> RobotMotion:
-    """Return the motion of a simulated drive."""
-    simulated = motion_of(options)
-    t: Floats = MOTION_STEP * np.arange(int(simulated.duration / MOTION_STEP) + 1, dtype=float)
-    state = simulated.at(t)
-    side: Floats = state.sway[:, 0] * (options.drive in HOLONOMIC)
-    return RobotMotion(t, state.speed, side, state.yaw_rate, np.empty((0, 2)))
 
 
 def ratio_sigma(method: MethodResult) -> float | None:

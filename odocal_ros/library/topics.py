@@ -195,7 +195,7 @@ def _fits_slot(msgtype: str, slot: str) -> bool:
 
 def _missing_topic_text(topics: Topics, slot: str, names: list[str], config: Config,
                         mapping: dict[str, str]) -> str:
-    """Return why no or several topics, ``names``, fit a slot, and the option that selects one."""
+    """Return the reason why not one topic fits a slot, and its option; names : that fit it."""
     fix = mapping.get('fix', '')
     if slot == 'odometer' and fix and not names and topics[fix].msgtype in ODOMETERS:
         return (f'no odometer in the bag besides {fix}, which is the position reference '

@@ -90,7 +90,8 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'journal': view.journal_folder, 'journal_error': view.journal_error,
         'computing_stage': stage.name, 'computing_passes': stage.passes,
         'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done,
-    } | quantities.limit_keys(checks) | status_keys(view.forecast, view.forecast_age_s)
+    } | {f'{name}_ok': answer for name, answer in checks.items()} | status_keys(
+        view.forecast, view.forecast_age_s)
     return DiagnosticStatus(
         level=level(view), name=STATUS_NAME, message=sentence(view, hint, checks),
         hardware_id='odocal',

@@ -20,7 +20,7 @@ from odocal_ros.sim.draw_effects import EFFECTS, RARE
 from odocal_ros.sim.noise import make_rng
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real_effects import RealEffects
-from odocal_ros.sim.vehicle_distributions import BY_GRADE, DRAWN_GRADES, to_tuple, Vehicle
+from odocal_ros.sim.vehicle_distributions import BY_GRADE, DRAWN_GRADES, flat, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')    # scenarios of the zoo
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each defines the only odometer
@@ -91,7 +91,7 @@ def _ideal_vehicle(seed: int, kind: str, grade: str,
         'scenario': kind, 'seed': seed, 'imu_grade': grade, 'heading': heading, 'slope': slope,
         'roll': roll, 'pitch': float(np.clip(pitch, -0.2, 0.2)), 'yaw': yaw,
         'mounting_rpy': (0.0, 0.0, nominal_quarter_turns * math.pi / 2),
-        'antenna_lever_arm': to_tuple(antenna), 'imu_lever_arm': to_tuple(imu),
+        'antenna_lever_arm': flat(antenna), 'imu_lever_arm': flat(imu),
         'odometer_lever_arm': (0.0, 0.0, -0.1 if robot else -0.3),
         'odometer_rate': 50.0, 'fix_rate': fix_rate,
         'fix_noise': 'rtk' if rtk else 'white', 'fix_sigma': 0.02 if rtk else 1.5,

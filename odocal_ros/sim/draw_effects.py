@@ -13,16 +13,7 @@ import math
 import numpy as np
 
 from odocal_ros.settings.nominal import GRADES
-from odocal_ros.sim.vehicle_distributions import (
-    DEG,
-    Effect,
-    G,
-    KMH,
-    lognormal,
-    MG,
-    to_tuple,
-    Vehicle,
-)
+from odocal_ros.sim.vehicle_distributions import DEG, Effect, flat, G, KMH, lognormal, MG, Vehicle
 
 # judgement: turn-on bias of the accelerometer's axes over that of the grade (docs/zoo.md)
 AXIS_RATIOS = [1, 1, 1.3]
@@ -40,21 +31,21 @@ def triads(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
         # a data sheet limits it to three sigmas
         np.fill_diagonal(M, vehicle.grade_value(f'{sensor} scale')
                          * np.clip(rng.standard_normal(3), -3.0, 3.0))
-        real[name] = to_tuple(M)
+        real[name] = flat(M)
     return Effect(real=real)
 
 
 def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Draw the sensitivity of each gyro to specific force along each axis."""
     sigma = vehicle.grade_value('g sensitivity')
-    return Effect(real={'g_sensitivity': to_tuple(rng.normal(0.0, sigma, 9))})
+    return Effect(real={'g_sensitivity': flat(rng.normal(0.0, sigma, 9))})
 
 
 def bias(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Draw turn-on biases by the vehicle's class, and their drift during the run."""
     return Effect(real={
-        'gyro_bias': to_tuple(rng.normal(0.0, vehicle.grade_value('gyro bias'), 3)),
-        'accel_bias': to_tuple(
+        'gyro_bias': flat(rng.normal(0.0, vehicle.grade_value('gyro bias'), 3)),
+        'accel_bias': flat(
             rng.normal(0.0, vehicle.grade_value('accelerometer bias'), 3) * AXIS_RATIOS),
         'gyro_instability': vehicle.grade_value('gyro instability'),
         'accel_instability': vehicle.grade_value('accelerometer instability')})
@@ -68,7 +59,7 @@ def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     for name, sensor in (('gyro_slope', 'gyro'), ('accel_slope', 'accelerometer')):
         median, log_sigma = vehicle.grade_value(f'{sensor} slope')
         sign = rng.choice([-1, 1], 3)
-        real[name] = to_tuple(sign * (median * np.exp(log_sigma * rng.standard_normal(3))))
+        real[name] = flat(sign * (median * np.exp(log_sigma * rng.standard_normal(3))))
     lowest, highest = vehicle.grade_value('temperature rise')
     rise = rng.uniform(lowest, highest) * math.exp(-time_on / tau)
     return Effect(real=real | {'warm_rise': float(rise), 'warm_time': tau})
@@ -166,7 +157,7 @@ def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     for name in ('imu', 'antenna', 'odometer'):
         error = vehicle.grade_value('lever arm error') * rng.standard_normal(3)
         arm = np.array(vehicle.options[f'{name}_lever_arm'])
-        real[f'{name}_arm_error'] = to_tuple(-arm if is_unmeasured else error)
+        real[f'{name}_arm_error'] = flat(-arm if is_unmeasured else error)
     return Effect(real=real)
 
 
@@ -278,8 +269,8 @@ def bias_steps(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Change the biases at a time in mid-drive: a knock, a strained board, another supply."""
     accel, gyro = rng.normal(size=(2, 3))
     return Effect(real={
-        'accel_step': to_tuple(accel * MG * rng.uniform(1.0, 20.0) / np.linalg.norm(accel)),
-        'gyro_step': to_tuple(gyro * DEG * rng.uniform(0.01, 0.2) / np.linalg.norm(gyro)),
+        'accel_step': flat(accel * MG * rng.uniform(1.0, 20.0) / np.linalg.norm(accel)),
+        'gyro_step': flat(gyro * DEG * rng.uniform(0.01, 0.2) / np.linalg.norm(gyro)),
         'bias_step_at': float(rng.uniform(100.0, 300.0))})
 
 

@@ -240,18 +240,18 @@ def _check(options: SimOptions) -> None:
 
 
 def _check_number(name: str, value: float) -> None:
-    degrees = name in ANGLES
-    flag = '--' + name.replace('_', '-') + ('-deg' if degrees else '')
-    shown = math.degrees(value) if degrees else value
-    if not math.isfinite(value):
-        raise BadUsage(f'{flag} {value}: required: a finite number')
-    if name in POSITIVE and not value > 0:
-        raise BadUsage(f'{flag} {shown:g}: required: a number above 0')
-    if name in NOT_NEGATIVE and value < 0:
-        raise BadUsage(f'{flag} {shown:g}: required: 0 or more')
+    """Raise BadUsage for a value of an option that is out of range."""
+    in_degrees = name in ANGLES
+    flag = '--' + name.replace('_', '-') + ('-deg' if in_degrees else '')
+    shown = math.degrees(value) if in_degrees else value
     limit = (ANGLES | LIMITS).get(name, math.inf)
-    if abs(shown) > limit * (1 + 1e-12):
-        raise BadUsage(f'{flag} {shown:g}: the limit is {limit:g}')
+    for is_valid, text in (
+            (math.isfinite(value), 'required: a finite number'),
+            (name not in POSITIVE or value > 0, 'required: a number above 0'),
+            (name not in NOT_NEGATIVE or value >= 0, 'required: 0 or more'),
+            (abs(shown) <= limit * (1 + 1e-12), f'the limit is {limit:g}')):
+        if not is_valid:
+            raise BadUsage(f'{flag} {shown:g}: {text}')
 
 
 def _check_choice(flag: str, name: str, names: Collection[str]) -> None:

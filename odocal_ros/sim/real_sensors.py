@@ -9,13 +9,13 @@ it, multipath, tunnels; and its published velocity.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.geodesy import radii
+from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point_geodetic
 from odocal_ros.sim.noise import arrival_ns, gauss_markov, make_rng, PHASE, stamps
@@ -46,18 +46,8 @@ HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e
 OUTLIER_SIGMA = 5.0     # m/s, judgement: a wrong Doppler in a street
 
 
-class MountingAngles(NamedTuple):
-    """Mounting angles of an IMU, rad: of the sensor axes, and of the housing b."""
-
-    yaw: float
-    pitch: float
-    yaw_housing: float
-    pitch_housing: float
-
-
-def forward_angles(d_b: Floats) -> tuple[float, float]:
-    """Return yaw and pitch mounting angle for the forward axis of the vehicle in b, (3,), rad."""
-    d = np.asarray(d_b, dtype=float)
+def forward_angles(d: Floats) -> tuple[float, float]:
+    """Return yaw and pitch mounting angle, rad, for the forward axis of the vehicle in b, (3,)."""
     return float(-np.arcsin(d[1])), float(np.arctan2(d[2], d[0]))
 
 
@@ -78,12 +68,18 @@ def sensor_axes(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
     return np.stack([x, np.cross(z, x), z], -1)
 
 
-def mounting_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
-                    accel_matrix: Floats) -> MountingAngles:
-    """Return the mounting angles for given rotations; matrices : as RealEffects, in i."""
-    d = np.asarray(C_vb)[0]
-    R = sensor_axes(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
-    return MountingAngles(*forward_angles(R.T @ d), *forward_angles(d))
+def mounting_angles(options: SimOptions) -> dict[str, float]:
+    """Return yaw and pitch of the sensor axes and of the housing, rad, as fields of ``Truth``."""
+    gyro, accel = options.real.matrix('gyro_matrix'), options.real.matrix('accel_matrix')
+    yaw, pitch = yaw_housing, pitch_housing = options.yaw, options.pitch
+    if options.roll or gyro.any() or accel.any():
+        # with a roll the angles are those of forward: docs/conventions.md
+        d = matrix_from_rpy([options.roll, options.pitch, options.yaw])[0]
+        C_bi = matrix_from_rpy(options.mounting_rpy)
+        axes = sensor_axes(C_bi @ gyro @ C_bi.T, C_bi @ accel @ C_bi.T)
+        (yaw, pitch), (yaw_housing, pitch_housing) = forward_angles(axes.T @ d), forward_angles(d)
+    return {'yaw': yaw, 'pitch': pitch, 'yaw_housing': yaw_housing,
+            'pitch_housing': pitch_housing}
 
 
 def with_triad_errors(w_i: Floats, f_i: Floats, real: RealEffects) -> tuple[Floats, Floats]:

@@ -21,7 +21,7 @@ from odocal_ros.sim.motion import attitude, Motion, NO_SWAY, Start
 from odocal_ros.sim.noise import make_rng, stamps
 from odocal_ros.sim.options import DEFAULTS, Reference, REFERENCES, resolve, SimOptions
 from odocal_ros.sim.profile import hermite, Hills, Profile
-from odocal_ros.sim.real_sensors import mounting_angles, MountingAngles, velocity
+from odocal_ros.sim.real_sensors import mounting_angles, velocity
 from odocal_ros.sim.routes import Route, ROUTES, with_sideways_moves
 from odocal_ros.sim.wheels import leg_factor, wheels_of
 
@@ -203,18 +203,7 @@ def _truth(motion: Motion, options: SimOptions, imu: samples.ImuSamples) -> Trut
     return Truth(
         scale=scale, scale_ratio=scale / options.nominal_scale,
         wheel_scales=tuple(factor * wheel.scale for wheel in wheels_of(options)),
-        **_mounting_angles(options)._asdict(),
+        **mounting_angles(options),
         heading=float(heading_from_yaw(np.arctan2(x_n[1], x_n[0]))), distance=motion.distance,
         start_ns=int(imu.stamp_ns[start]), stop_ns=int(imu.stamp_ns[-1]),
         gyro_bias=gyro_bias, accel_bias=accel_bias)
-
-
-def _mounting_angles(options: SimOptions) -> MountingAngles:
-    """Return the true mounting angles."""
-    real = options.real
-    gyro, accel = real.matrix('gyro_matrix'), real.matrix('accel_matrix')
-    if not (options.roll or gyro.any() or accel.any()):
-        return MountingAngles(options.yaw, options.pitch, options.yaw, options.pitch)
-    # with a roll the angles are those of forward: docs/conventions.md
-    return mounting_angles(matrix_from_rpy([options.roll, options.pitch, options.yaw]),
-                           matrix_from_rpy(options.mounting_rpy), gyro, accel)

@@ -94,6 +94,6 @@ def lognormal(rng: np.random.Generator, median: float, log_sigma: float) -> floa
     return float(median * np.exp(log_sigma * rng.standard_normal()))
 
 
-def to_tuple(values: Floats) -> tuple[float, ...]:
+def flat(values: Floats) -> tuple[float, ...]:
     """Return the numbers of an array of any shape, row by row."""
     return tuple(float(x) for x in np.ravel(values))

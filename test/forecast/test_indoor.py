@@ -5,7 +5,7 @@
 
 import math
 
-from drives import thinned
+from drives import robot_motion, thinned
 import numpy as np
 import pytest
 
@@ -14,7 +14,7 @@ from odocal_ros.forecast.forecast import LegEnded
 from odocal_ros.forecast.planned_indoor import predict_robot, Robot
 from odocal_ros.forecast.robot_motion import pattern_motion, PATTERNS
 from odocal_ros.forecast.smoother_forecast import planar_forecast
-from odocal_ros.library.plan_indoor import motion_of_drive, plan_indoor, ratio_sigma, robot_of
+from odocal_ros.library.plan_indoor import plan_indoor, ratio_sigma, robot_of
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -59,7 +59,7 @@ def test_the_forecast_is_near_the_sigma_of_a_simulated_run(drive, imu, values):
         'odometer.left': 'left', 'odometer.right': 'right', 'odometer.drive': drive,
         'imu.grade': 'industrial'})
     method = calibrate(made.leg(), config).methods['smoother' if imu else 'planar']
-    found = predict_robot(motion_of_drive(made.options), robot_of(made.options), config)
+    found = predict_robot(robot_motion(made.options), robot_of(made.options), config)
     for name, most in values.items():
         then, now = method.estimates[name], found.estimates[name]
         size = 1.0 if now.unit == 'rad' else then.value / now.value
