@@ -45,7 +45,7 @@ def parameter_gradient(f: Floats) -> Floats:
 
 def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> dict[str, Floats]:
     """
-    Return the gyro sources as chord errors, by name, (3, k) m for one sigma: docs/method.md (T10).
+    Return the chord errors of the gyro's error sources, by name, (3, k) m, 1 sigma: (T10).
 
     t : (m,) epochs from the start of the leg to its end, s.   D : (m, 3) dead-reckoned
     displacement from the start, n, m.   q_nb : (m, 4) attitude, x y z w.   alignment : sigmas.
@@ -58,7 +58,7 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
     # a misaligned axis j measures a share of the turn about each axis k
     axes = np.einsum('nij,nk->ijk', effect, map_windows(_step_rotations, q_nb)).reshape(3, 9)
     scale, off_diagonal = np.eye(3, dtype=bool).ravel(), ~np.eye(3, dtype=bool).ravel()
-    # R(u): integral of r from u to the end; a bias step at u acts on all of it
+    # R(u): integral of r from u to the end, a sum from the end; a bias step at u acts on all of it
     integrals = (r[:-1] + r[1:]) / 2 * dt[:, None]
     R = np.concatenate([np.cumsum(integrals[::-1], axis=0)[::-1], np.zeros((1, 3))])
     return {f'gyro_bias_{axis}': bias[:, i:i + 1] for i, axis in enumerate('xyz')} | {

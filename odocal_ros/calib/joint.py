@@ -151,7 +151,7 @@ def _find_differing(legs: LinkedLegs, scatter: dict[str, float],
                     usual_scatter: Mapping[str, float]) -> tuple[str, ...]:
     """Return the constants in which legs differ by more than the usual scatter."""
     def deviate(name: str) -> float:
-        """Return the normal deviate of the chi-square that a free constant in each leg removes."""
+        """Return the normal deviate of the chi-square decrease by one value of it in each leg."""
         chi2, freedom = (legs.disagreement({**scatter, name: usual_scatter[name]})
                          if name in usual_scatter else with_scatter)
         free_chi2, free_freedom = legs.disagreement({**scatter, name: np.inf})

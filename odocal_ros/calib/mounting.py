@@ -48,7 +48,7 @@ class Mounting:
 
     @property
     def why_unknown(self) -> str:
-        """Return the reason why the rotation is not known, '' if it is."""
+        """Return the cause if the rotation is not known, '' if it is."""
         sigma, deviation, limit = np.rad2deg([self.forward_sigma, self.deviation, AXIS_LIMIT])
         if self.C_bi is not None:
             return ''

@@ -93,9 +93,9 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     delay_looks_like_slip = len(windows.slips(0.0)[0]) > len(t)
     speed = K * np.diff(np.interp(grid + delay, track.t, track.s)) / EXCESS_GRID
     mean_speed = np.convolve(speed, np.full(5, 0.2), 'valid')      # over a second
-    sign = [travel_error_sign(middle - SLIP_WINDOW / 2, SLIP_WINDOW, metres, grid[:-5], mean_speed)
-            for middle, metres in zip(t, size, strict=True)]
-    return Slips(t, size, delay if delay_looks_like_slip else 0.0, np.array(sign, int))
+    signs = [travel_error_sign(middle - SLIP_WINDOW / 2, SLIP_WINDOW, metres, grid[:-5],
+                               mean_speed) for middle, metres in zip(t, size, strict=True)]
+    return Slips(t, size, delay if delay_looks_like_slip else 0.0, np.array(signs, int))
 
 
 @dataclass(frozen=True, eq=False)

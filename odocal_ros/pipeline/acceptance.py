@@ -122,9 +122,9 @@ def _explain_undecided(undecided: ValueDecision, reasons: tuple[Reason, ...]) ->
     """Return the explanation why a value is undecided, and the remedy."""
     name, estimate = undecided.name.replace('_', ' '), undecided.estimate
     if estimate.value is None or estimate.sigma is None:
-        about = 'scale_factor' if undecided.name == 'scale_ratio' else undecided.name
+        parameter = 'scale_factor' if undecided.name == 'scale_ratio' else undecided.name
         reason = next((reason for reason in reasons
-                       if REASON_ESTIMATES.get(reason.code) == about), None)
+                       if REASON_ESTIMATES.get(reason.code) == parameter), None)
         if undecided.name == 'scale_ratio' and reason is None:
             return f'{name} is not known', 'Set odometer.nominal_scale.'
         return f'{name} is not determined', (reason or DRIVE_MORE[undecided.name]).remedy

@@ -48,8 +48,8 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     Return the calibration of one vehicle from its legs.
 
     legs : at least one. Rejected legs are reported and left out, unless all are rejected.
-    config : limits, frames.   carried : information of earlier legs on the vehicle.   imu :
-    information of other legs on its IMU, if nothing is carried.
+    config : limits, frames.   carried : information of earlier legs on the vehicle, from an
+    earlier result.   imu : information of other legs on its IMU, used without ``carried``.
     """
     legs = tuple(legs)
     usable = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]

@@ -93,9 +93,9 @@ class PreparedLeg(LocatedFixes):
     wheel_slips: WheelSlips              # of one wheel relative to the other
     metres_per_unit: float               # approximate, until a method estimates a better one
     distance: float                      # m, path length by ``metres_per_unit``
-    t_fit: float                         # s; if ``holdout``, later fixes are held out
-    holdout: bool
-    reasons: tuple[Reason, ...]          # of the leg
+    t_fit: float                         # s, end of the data that a fit uses
+    holdout: bool                        # True: fixes after ``t_fit`` check the result
+    reasons: tuple[Reason, ...]          # on the leg, for all methods
     end_reasons: tuple[Reason, ...]      # only for methods that use its end points alone
 
     def path(self, f: Floats, track: dead_reckoning.Track | None = None) -> Path:
@@ -124,7 +124,7 @@ class PreparedLeg(LocatedFixes):
 
     @cached_property
     def path_ratio(self) -> float | None:
-        """Return metres per unit of travel by fixes along ``level_path``, None if they stand."""
+        """Return metres per unit of travel from fixes and ``level_path``, None if they stand."""
         t, travel = self.inputs.t_fix, self.inputs.travel
         inside = (t >= max(travel.t[0], self.track.t[0])) & (
             t <= min(travel.t[-1], self.track.t[-1]))
@@ -183,7 +183,7 @@ class PreparedLeg(LocatedFixes):
         return Slips(slips.t[kept], slips.size[kept], slips.delay, slips.travel_error_sign[kept])
 
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
-        """Return the antenna's position at t by fixes or surveyed mark, None without either."""
+        """Return the antenna's position at t from fixes or a surveyed mark, None without them."""
         point, span = self._surveyed_point(name, t), standing_at(t, self.standstills)
         if point:
             latitude, longitude, height, sigma = point      # deg, deg, m, m
@@ -262,7 +262,7 @@ class Comparison(NamedTuple):
 
 
 def _compare(prepared: PreparedLeg, paths: Sequence[Path], start: MarkFix) -> Comparison:
-    """Return the comparison of paths; the last one has the position of ``start`` there."""
+    """Return the comparison of paths; start: mark at which the last path and the fixes agree."""
     anchor: MarkFix | None = start
     begin, end = start.t, prepared.t_fit
     reasons: tuple[Reason, ...] = ()

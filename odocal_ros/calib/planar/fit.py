@@ -87,9 +87,9 @@ def fit_at(run: Run, knowledge: PriorKnowledge, state: Floats, c: Floats, levels
     residuals refer.   prior : (m, m) information.   student_weights : None: equal.
     """
     # the information of Student's distribution is 3/4 of that of a normal one
-    even = {'white': np.ones(len(run.node)), 'drift': np.ones(len(state))}
+    equal_weights = {'white': np.ones(len(run.node)), 'drift': np.ones(len(state))}
     student_weights = {name: weight * (STUDENT_FREEDOM + 2) / (STUDENT_FREEDOM + 4) / weight.mean()
-                       for name, weight in (student_weights or even).items()}
+                       for name, weight in (student_weights or equal_weights).items()}
     rows = _rows(run, knowledge, state, c, first_gains, student_weights)
     equations = {name: normal_equations(r, len(state)) for name, r in rows.items()}
     solution = _solve(equations, levels, prior, 0 * c)
@@ -101,7 +101,7 @@ def fit_at(run: Run, knowledge: PriorKnowledge, state: Floats, c: Floats, levels
 
 def priors(run: Run, knowledge: PriorKnowledge, left: float, right: float, width: float,
            ) -> tuple[Floats, Floats]:
-    """Return first values (m,) and prior information (m, m) of the constants."""
+    """Return prior values (m,) and prior information (m, m) of the constants."""
     wheel_values, covariance = run.wheels.prior(left, right, width)
     others = [*((value, knowledge.offset_sigma) for value in knowledge.offset),
               (0.0, knowledge.delay_sigma)]
