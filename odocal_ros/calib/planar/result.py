@@ -179,7 +179,7 @@ def _fit_reasons(fit: Fit) -> list[Reason]:
     if fit.levels[noisy] > NOISE_LIMIT:
         reasons.append(Reason(
             Code.NOT_CONVERGED, f'wheels and positions differ by {1e3 * fit.levels[noisy]:.0f} mm '
-            f'in a metre {WHEEL_NOISE[noisy]}; the limit is {1e3 * NOISE_LIMIT:.0f} mm',
+            f'over a metre {WHEEL_NOISE[noisy]}; the limit is {1e3 * NOISE_LIMIT:.0f} mm',
             'Check the order of odometer.wheels, odometer.drive, odometer.time_offset and '
             'gnss.time_offset.'))
     return reasons
