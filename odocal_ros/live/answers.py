@@ -92,11 +92,7 @@ def error_line(error: BaseException) -> str:
 
 
 def hint(view: SessionView, action_first: bool = False) -> str:
-    """
-    Return the action: provide missing inputs, or the next step.
-
-    action_first : for a single line: in a leg, the action comes before the estimate.
-    """
+    """Return the next action; action_first : in a leg, it comes before the estimate."""
     session, state = view.session, view.session.state
     if state is State.COMPUTING:
         return f'computing: {view.stage.as_text() or "started"}; the result follows on ~/status'

@@ -57,9 +57,8 @@ class LegCompletion:
         self._observability: Observability | None = None      # of the leg last started
         # steady time until which a stopped leg waits for its last samples
         self._samples_until_ns: int | None = None
-        # of the stopped leg: samples, kept for a retry, and view before its stop mark
-        self._snapshot: LegRecorder | None = None
-        self._view_at_stop: SessionView | None = None
+        self._snapshot: LegRecorder | None = None      # samples of the stopped leg, for a retry
+        self._view_at_stop: SessionView | None = None  # before the mark of the stopped leg
         self._distance_m = 0.0           # of the leg that changed last
         self._is_imu_silent = False      # in the recorded leg
         self._console = Console(self._log)
@@ -79,9 +78,8 @@ class LegCompletion:
             self._restart_after_jump()
         self._stop_when_too_long()
         self._close_when_complete()
-        if self._view_at_stop is not None and self.session.state is State.COMPUTING:
-            self._active_job.answer_expired(
-                partial(answers.provisional_answer, self._view_at_stop))
+        if (view := self._view_at_stop) and self.session.state is State.COMPUTING:
+            self._active_job.answer_expired(partial(answers.provisional_answer, view))
         if self.session.state is State.RECORDING:
             self._running_estimate.update(self._recording.newest_ns,
                                           self._recording.progress.distance_m())
@@ -152,8 +150,8 @@ class LegCompletion:
             duplicate_publishers=inputs.duplicate_publishers(),
             lost_messages=inputs.lost_messages(), rates_hz=recording.rates_hz(),
             clock_differences=progress.clocks.find_differing(config),
-            results=self._publishing.results(),
-            restored_stamp=session.restored_stamp(), distance_m=self._distance_m,
+            results=self._publishing.results(), restored_stamp=session.restored_stamp(),
+            distance_m=self._distance_m,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0,
             max_speed=progress.max_speed(), still_s=progress.still_s(),
             two_wheels=recording.two_wheels(),
@@ -204,9 +202,8 @@ class LegCompletion:
         self._observability = find_observable(session.config, self._recording.received_before(
             session.config.leg.preroll))
         self.show_status()
-        text = (f'recording leg {session.leg_id} since {iso(mark_ns)}; '
-                f'{answers.hint(self.view())}. With these settings, '
-                + self._observability.as_text())
+        text = (f'recording leg {session.leg_id} since {iso(mark_ns)}; {answers.hint(self.view())}'
+                f'. With these settings, {self._observability.as_text()}')
         self._log.info(text)
         return text
 
@@ -299,6 +296,5 @@ class LegCompletion:
     def _save(self, calibration: Calibration, by_operator: bool = False) -> Future:
         inputs = self._recording.inputs
         config = replace(self.session.config, output=self._config().output)   # may be new
-        return self._saver.save(calibration, config, inputs.topics,
-                                 inputs.by_slot['imu'].frame, self._clock.now().nanoseconds,
-                                 by_operator)
+        return self._saver.save(calibration, config, inputs.topics, inputs.by_slot['imu'].frame,
+                                self._clock.now().nanoseconds, by_operator)

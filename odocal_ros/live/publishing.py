@@ -45,9 +45,8 @@ DECIMALS = dict.fromkeys((
 # results of the status, and the unit in their keys
 KEY_UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad',
              'scale_factor_left': '', 'scale_factor_right': '', 'track_width': '_m'}
-RESULT_PARAMETERS = {      # by key
-    f'{name}{end}{unit}': f'result.{name}{end}'
-    for name, unit in KEY_UNITS.items() for end in ('', '_sigma')}
+RESULT_PARAMETERS = {f'{name}{end}{unit}': f'result.{name}{end}'      # by key
+                     for name, unit in KEY_UNITS.items() for end in ('', '_sigma')}
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
 # names of inputs in /diagnostics, if not those of the slots
 SLOT_NAMES = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
@@ -73,8 +72,7 @@ def calibration_status(view: SessionView) -> DiagnosticStatus:
         'legs': results['result.legs'] if view.restored_stamp else len(session.legs),
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
         'restored': view.restored_stamp, 'standstill_s': view.still_s,
-        'max_speed_mps': view.max_speed,
-        'distance_to_minimum_m': answers.metres_to_go(view),
+        'max_speed_mps': view.max_speed, 'distance_to_minimum_m': answers.metres_to_go(view),
         'seconds_to_stand': answers.seconds_to_stand(view),
         'required_scale_sigma_ppm': view.config.verdict.max_scale_sigma * 1e6,
         'required_yaw_sigma_deg': math.degrees(view.config.verdict.max_yaw_sigma),

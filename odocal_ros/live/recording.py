@@ -80,8 +80,7 @@ class Inputs:
     def leading_input(self) -> Input:
         """Return the topic whose stamps set the marks: the IMU, or else the odometer."""
         imu = self.by_slot['imu']
-        is_leading = self._needs_imu or imu.newest_ns
-        return imu if is_leading else self.by_slot['odometer']
+        return imu if self._needs_imu or imu.newest_ns else self.by_slot['odometer']
 
     def missing_reasons(self, config: Config) -> list[str]:
         """Return the causes that prevent a leg, one line per missing topic."""
@@ -99,8 +98,8 @@ class Inputs:
                 for source in self.by_slot.values()}
 
     def duplicate_publishers(self) -> list[str]:
-        return list(filter(None,
-                           (source.duplicate_publishers() for source in self.by_slot.values())))
+        texts = (source.duplicate_publishers() for source in self.by_slot.values())
+        return [text for text in texts if text]
 
     @property
     def topics(self) -> dict[str, str]:

@@ -8,9 +8,11 @@ The status comes from another process: its keys and values are untrusted.
 """
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 import math
 from math import degrees, isfinite, nan
 import time
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
@@ -113,7 +115,15 @@ def _values(status: dict[str, str]) -> str:
     return provisional + ('   '.join(texts) or 'no value yet')
 
 
-class StatusListener:
+class Status(NamedTuple):
+    """A status as received, with the hint that was sent with it."""
+
+    level: bytes
+    values: dict[str, str]
+    hint: str
+
+
+class StatusListener(AbstractContextManager['StatusListener']):
     """A separate node that receives statuses; a context manager and an iterator over them."""
 
     def __init__(self, node_name: str, wait_s: float = math.inf) -> None:
@@ -142,16 +152,13 @@ class StatusListener:
     def _receive_hint(self, message: String) -> None:
         self._hint = brief_line(message.data)
 
-    def __enter__(self) -> 'StatusListener':
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._executor.shutdown()
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def __iter__(self) -> Iterator[tuple[bytes, dict[str, str], str]]:
-        """Yield (level, key -> value, hint) of each status, until the context ends."""
+    def __iter__(self) -> Iterator[Status]:
+        """Yield each status, until the context ends."""
         try:
             while self._context.ok() and time.monotonic() < self._until:
                 self._executor.spin_once(timeout_sec=0.5)
@@ -160,7 +167,7 @@ class StatusListener:
                 if self._status is not None and self._hint is not None:
                     status = self._status.status[0]
                     self._status, self._until = None, math.inf
-                    yield (status.level, {brief_line(kv.key): brief_line(kv.value)
-                                          for kv in status.values[:MAX_VALUES]}, self._hint)
+                    yield Status(status.level, {brief_line(kv.key): brief_line(kv.value)
+                                                for kv in status.values[:MAX_VALUES]}, self._hint)
         except ExternalShutdownException:
             return

@@ -6,6 +6,7 @@
 from collections.abc import Callable
 import ctypes
 from dataclasses import dataclass
+from functools import partial
 import math
 import queue
 import threading
@@ -131,8 +132,7 @@ class Worker:
 
     def __init__(self) -> None:
         self._jobs: queue.Queue[tuple[Job, OnDone] | None] = queue.Queue()
-        self._outcomes: queue.SimpleQueue[tuple[OnDone, Any, Exception | None]] = (
-            queue.SimpleQueue())
+        self._deliveries: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
         self._thread.start()
 
@@ -146,9 +146,8 @@ class Worker:
 
     def poll(self) -> None:
         """Deliver the results of finished jobs."""
-        while not self._outcomes.empty():
-            on_done, result, error = self._outcomes.get()
-            on_done(result, error)
+        while not self._deliveries.empty():
+            self._deliveries.get()()
 
     def close(self, grace_s: float = JOB_GRACE_S) -> bool:
         """Let the thread end after its queue; return True if it ended within ``grace_s``."""
@@ -160,9 +159,9 @@ class Worker:
         while (entry := self._jobs.get()) is not None:
             job, on_done = entry
             try:
-                self._outcomes.put((on_done, job(), None))
+                self._deliveries.put(partial(on_done, job(), None))
             except Exception as error:
-                self._outcomes.put((on_done, None, error))
+                self._deliveries.put(partial(on_done, None, error))
             del entry, job, on_done      # release the job's leg now, not at the next job
             release_memory()
             self._jobs.task_done()
