@@ -73,7 +73,8 @@ def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientati
                        inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.min_motion)
     reasons = gyro_reasons(ratio, gyro_scale)
     if not any(reason.code is Code.GYRO_SIGN for reason in reasons):
-        return ratio, wrong_axis_reasons(inputs, located, orientation) or reasons
+        axis_reasons = wrong_axis_reasons(inputs, located, orientation)
+        return ratio, axis_reasons if axis_reasons else reasons
     text = reasons[0].text
     if orientation and abs(orientation.centripetal) > max(
             -INVERTED_RATIO, SIGN_SIGMAS * orientation.centripetal_sigma):

@@ -80,7 +80,7 @@ def wheel_faults(axle: Sequence[Travel], imu: ImuRows, t_stop: float, track: Tra
     right_scale = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
     fitted_width, width_sigma = coefficients[1] * right_scale, np.sqrt(
         covariance[1, 1]) * right_scale                     # m
-    width = track_width or abs(fitted_width)
+    width = track_width if track_width else abs(fitted_width)
     reasons = regression.side_reasons(pair, fitted_width, width_sigma, track_width)
     reasons += regression.counter_reasons(pair, ratio, width, max_deviation)
     residual = (pair.right - regressors @ coefficients) * right_scale

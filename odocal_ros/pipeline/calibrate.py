@@ -112,7 +112,8 @@ def screen_leg(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screen
     # a turn of gravity takes precedence: the mean gravity of the other test is then meaningless
     if gravity_turns := gravity_turn_reasons(inputs):
         imu_reasons, z_down = gravity_turns, False
-    imu_reasons = imu_reasons or unit_change_reasons(inputs)
+    if not imu_reasons:
+        imu_reasons = unit_change_reasons(inputs)
     reasons += tuple(with_mounting_remedy(imu_reasons, inputs))
     release_mapped_memory()
     if z_down:      # forward-right-down: rotated to forward-left-up

@@ -55,7 +55,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     usable = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]
     overlapping = overlapping_legs(usable)
     usable = [leg for leg in usable if leg not in overlapping]
-    used = usable or legs
+    used = usable if usable else legs
     method_names = dict.fromkeys(name for leg in used for name in leg.methods)
     carried = carried if carried and _precedes(carried, used) else None
     # the IMU constants must be from other legs than these

@@ -50,8 +50,9 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
                      if inputs.has_accelerometer else None)
     orientation = None if accelerations is None else imu_orientation.orientation_of(accelerations)
     reasons = (*reasons, *drive.odometer_span_reasons(inputs.travel, inputs.t_stop))
-    axis_faults = forward_turn_reasons(accelerations) or check_turns(
-        inputs, located, orientation, config.imu.gyro_scale)[1]
+    axis_faults = forward_turn_reasons(accelerations)
+    if not axis_faults:
+        _, axis_faults = check_turns(inputs, located, orientation, config.imu.gyro_scale)
     if axis_faults:             # a mirrored axis turns the orientation around
         return None, (*reasons, *axis_faults)
     axis_reasons = imu_orientation.orientation_reasons(orientation, config.imu.nominal_yaw)
@@ -110,11 +111,12 @@ def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reaso
     refusal_reasons = drive.motion_reasons(
         inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.t_stop,
         inputs.min_motion)
-    if refusal_reasons or not located.rough_scale:
-        return refusal_reasons or (Reason(
-            Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale',
-            'Drive farther between the marks. If the vehicle did, check the receiver (static '
-            'hold off).'),)
+    if refusal_reasons:
+        return refusal_reasons
+    if not located.rough_scale:
+        return (Reason(Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale',
+                       'Drive farther between the marks. If the vehicle did, check the receiver '
+                       '(static hold off).'),)
     between_marks = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
     min_rows = 4    # of the IMU between the marks, for an attitude
     if between_marks.sum() < min_rows:

@@ -177,13 +177,15 @@ class TwoPointRun:
             prepared.level_path(t[keep]), position_n[keep, :2], t[keep], sigma)
         reversed_reasons = reversals.reversal_reasons(sections, self.config.odometer.signed)
         self.data_reasons += reversed_reasons
-        if not reversed_reasons:
-            residuals = track_check.track_residuals(prepared.path(f), two_point.start, fixes)
-            statistics = track_check.track_statistics(residuals, prepared.distance)
-            self.reasons += track_check.distance_reasons(
-                statistics, prepared.fix_sigma, drift, prepared.distance
-            ) or track_check.bend_reasons(t, residuals, two_point.M @ f, prepared.fix_sigma, drift,
-                                          prepared.distance)
+        if reversed_reasons:
+            return
+        residuals = track_check.track_residuals(prepared.path(f), two_point.start, fixes)
+        limits = prepared.fix_sigma, drift, prepared.distance
+        distance_reasons = track_check.distance_reasons(
+            track_check.track_statistics(residuals, prepared.distance), *limits)
+        self.reasons += distance_reasons
+        if not distance_reasons:
+            self.reasons += track_check.bend_reasons(t, residuals, two_point.M @ f, *limits)
 
     def _check_counting_direction(self, two_point: TwoPointInput) -> None:
         """Add the reason for an odometer that counts down without a known IMU orientation."""
