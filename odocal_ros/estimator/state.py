@@ -54,9 +54,10 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_delay', 'gnss_delay', 'heading_offset', 'fix_motion_time',
              *GYRO_ERRORS, *ACCEL_ERRORS,
              'fix_lag_square', 'fix_error_by_motion', 'gnss_clock_rate', 'odometer_clock_rate',
-             'odometer_lag_square', 'scale_by_speed', 'scale_by_time', 'scale_by_pull',
-             'scale_by_braking', 'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk',
-             'sideslip_by_jerk',
+             'odometer_lag_square',
+             'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
+             'scale_by_pitching',
+             'squat', 'dive', 'squat_by_jerk', 'sideslip', 'sideslip_by_jerk',
              'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns',
              'body_centre_height', 'sway_by_force', 'lift_by_turning', 'mean_roll',
              'fix_height_drift', 'fix_error_east', 'fix_error_north', 'fix_error_up',
@@ -104,9 +105,10 @@ FAST_SPEED = 20.0           # m/s, definition: at which the slope is stated, a c
 # if the axle keeps its direction, 0 if it follows the body, negative if bumps are shorter than the
 # wheelbase
 SCALE_BY_PITCHING = CONSTANTS.index('scale_by_pitching')
-# pitch and yaw of the forward axis due to forward and left acceleration, rad per m/s^2, and by
-# their rates of change, rad per m/s^3, (S12): the body reacts with a delay, tyres immediately
-BODY_LEAN = constants_from('squat', 'sideslip_by_jerk')
+# pitch and yaw of the forward axis due to acceleration forward (from traction, from braking) and
+# left, rad per m/s^2, and to their rates of change, rad per m/s^3, (S12): a body reacts with a delay
+PITCH_LEAN = constants_from('squat', 'squat_by_jerk')
+YAW_LEAN = constants_from('sideslip', 'sideslip_by_jerk')
 # displacements of the axle due to the tilt of the body, (S12): points about which it pitches, m
 # ahead of the odometer: on hills; in addition on bumps; in turns about its own left axis, on
 # banked ground. Height above the odometer, m, of the centre about which it tilts on its springs;
@@ -128,10 +130,11 @@ IMPERFECTIONS = constants_from('gyro_scale_z', 'sway_by_force')
 # their kinds, with one common size each: numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
-              'clock_rate': 2, 'odometer_lag_square': 1, 'scale_by_speed': 1, 'scale_by_time': 1,
-              'scale_by_force': 2, 'scale_by_pitching': 1, 'squat': 1, 'sideslip': 1,
-              'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 2,
-              'pitch_centre_in_turns': 1, 'body_centre_height': 1, 'sway_by_force': 1}
+              'clock_rate': 2, 'odometer_lag_square': 1,
+              'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2,
+              'scale_by_pitching': 1, 'squat': 2, 'squat_by_jerk': 1, 'sideslip': 1,
+              'sideslip_by_jerk': 1, 'pitch_centre': 2, 'pitch_centre_in_turns': 1,
+              'body_centre_height': 1, 'sway_by_force': 1}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECTIONS
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')

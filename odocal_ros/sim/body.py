@@ -45,7 +45,8 @@ def tilts(speed: Profile, yaw_rate: Profile, real: RealEffects, hills: Hills | N
     # nose up is a negative pitch; in a turn to the left the left side goes up
     roll, roll_rate = sprung_response(real.body_roll * side_force(speed, yaw_rate, lean, t)
                                       + real.kneeling * kneeling_degree(speed, t), step)
-    pitch, pitch_rate = sprung_response(-real.squat * forward, step)
+    braking = np.where(forward * speed(t) < 0, forward, 0.0)
+    pitch, pitch_rate = sprung_response(-real.squat * forward - real.brake_dive * braking, step)
     if lean:
         roll, roll_rate = roll + lean(t), roll_rate + lean.derivative()(t)
     return hermite(t, roll, roll_rate), hermite(

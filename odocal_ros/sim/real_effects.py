@@ -89,6 +89,7 @@ class RealEffects:
 
     sideslip: float = _signed(0.0)           # rad per m/s^2 to the side; outwards at the rear axle
     squat: float = _signed(0.0)                  # rad per m/s^2, nose up
+    brake_dive: float = _signed(0.0)    # rad per m/s^2 of braking, nose down, added to squat
     wheelbase: float = 0.0                   # m, the body is parallel to its chord; 0: to the road
     body_roll: float = _signed(0.0)              # rad per m/s^2, outwards
     banking: float = 0.0                         # share of the lateral force taken by banking

@@ -71,9 +71,9 @@ def test_side_force_of_the_tyres_includes_gravity_on_a_bank():
     left_up = np.einsum('ki,i->k', state.C_nb[:, 2], state.C_bv[:, 1])
     want = turning + G * follow_hills((left_up[1:] + left_up[:-1]) / 2)
     # up to a constant: the bank without lateral acceleration
-    off = motion.lean_accelerations[:, 1] - want
+    off = motion.yaw_lean[:, 0] - want
     assert np.abs(off[steady] - np.median(off)).max() < 0.1 * np.abs(turning).max()
-    assert np.abs(motion.lean_accelerations[steady, 1]).max() < 0.3 * np.abs(turning).max()
+    assert np.abs(motion.yaw_lean[steady, 0]).max() < 0.3 * np.abs(turning).max()
 
 
 def test_side_force_of_the_tyres_does_not_include_the_roll_of_the_body():
@@ -82,7 +82,7 @@ def test_side_force_of_the_tyres_does_not_include_the_roll_of_the_body():
     _, problem, state = at_truth(real=RealEffects(body_roll=by_force))
     motion = Equations(problem, state).factors['motion'].motion
     turning, steady = lateral_acceleration(motion, state)
-    np.testing.assert_allclose(motion.lean_accelerations[steady, 1], turning[steady],
+    np.testing.assert_allclose(motion.yaw_lean[steady, 0], turning[steady],
                                atol=0.02 * np.abs(turning).max())
     _, roll = motion.axle.rolls()
     np.testing.assert_allclose(roll[1:][steady], by_force * motion.axle.left_acceleration[1:][

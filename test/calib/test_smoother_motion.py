@@ -100,7 +100,8 @@ def test_tyres_and_springs_depend_on_the_axle_acceleration_for_any_imu_position(
     found = []
     for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
         _, problem, state = at_truth(imu_lever_arm=arm)
-        signals = Equations(problem, state).factors['motion'].motion.lean_accelerations[:, :2]
+        signals = Equations(problem, state).factors['motion'].motion
+        signals = np.hstack([signals.pitch_lean[:, :2], signals.yaw_lean[:, :1]])
         found.append((signals, Axle(problem, state).traction_acceleration(), problem))
     (at_axle, along, problem), (elsewhere, along_elsewhere, _) = found
     change = np.abs(np.diff(problem.rate_b[:, 2])).max()
@@ -117,7 +118,7 @@ def test_turn_rate_noise_is_not_a_side_force():
     _, problem, state = at_truth(imu_lever_arm=(3.4, 0.0, 0.0))
     noise = 2e-3 * np.random.default_rng(3).standard_normal(len(state.t))
     noisy = replace(problem, rate_b=problem.rate_b + np.outer(noise, state.C_bv[:, 2]))
-    left, noisy_left = (Equations(one, state).factors['motion'].motion.lean_accelerations[:, 1]
+    left, noisy_left = (Equations(one, state).factors['motion'].motion.yaw_lean[:, 0]
                         for one in (problem, noisy))
     assert np.abs(left).max() > 0.5
     # a path of 7 mm/s to the side, at more than 0.1 m/s, in the mean of the bank
@@ -131,24 +132,24 @@ def test_lean_axes_are_level_with_a_rolled_imu():
     motion = Equations(problem, state).factors['motion'].motion
     C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
     by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(
-        layout.SIZE_WITHOUT_SLOW)[2][:, 15:18, layout.BODY_LEAN]
-    sizes = np.linalg.norm(by, axis=1).max(axis=0)
-    assert (sizes > 0.1).all()
+        layout.SIZE_WITHOUT_SLOW)[2][:, 15:18]
     # the pitch axis of the mounting is level to second order of yaw and pitch, 1 deg each
-    assert np.abs(by[:, 1, 0]).max() < 0.005 * sizes[0]
-    assert np.abs(by[:, 2, 1]).max() < 0.005 * sizes[1]
+    for columns, axis in ((layout.PITCH_LEAN, 1), (layout.YAW_LEAN, 2)):
+        sizes = np.linalg.norm(by[..., columns], axis=1).max(axis=0)
+        assert (sizes > 0.1).all()
+        assert (np.abs(by[:, axis, columns]).max(axis=0) < 0.005 * sizes).all()
 
 
-def _rms_after_lean(real, axis, columns):
-    """Return the rms error along an axis, without and with fitted columns of BODY_LEAN."""
+def _rms_after_lean(real, axis, lean, counts):
+    """Return the rms error along an axis, without and with fitted first columns of a lean."""
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3, real=real)
-    error, by = along_axis(problem, state, axis, layout.BODY_LEAN)
-    rests = [error - by[:, c] @ np.linalg.lstsq(by[:, c], error, rcond=None)[0] for c in columns]
+    error, by = along_axis(problem, state, axis, lean)
+    rests = [error - by[:, :n] @ np.linalg.lstsq(by[:, :n], error, rcond=None)[0] for n in counts]
     return [np.sqrt((one**2).mean()) for one in (error, *rests)]
 
 
 def test_axle_slides_by_speed_times_turn_rate():
-    whole, rest = _rms_after_lean(RealEffects(sideslip=0.005), 1, [[0, 1]])
+    whole, rest = _rms_after_lean(RealEffects(sideslip=0.005), 1, layout.YAW_LEAN, [1])
     # the mean of a product over 1 s is not the product of means; a difference of velocities
     # left 3 %
     assert rest < 1e-3 * whole
@@ -156,7 +157,8 @@ def test_axle_slides_by_speed_times_turn_rate():
 
 def test_body_lean_is_delayed():
     """At least a third of the remaining squat is proportional to the change of acceleration."""
-    whole, rest, with_change = _rms_after_lean(RealEffects(squat=0.005), 2, [[0, 1], [0, 1, 2, 3]])
+    whole, rest, with_change = _rms_after_lean(
+        RealEffects(squat=0.005), 2, layout.PITCH_LEAN, [2, 3])
     assert rest < 0.3 * whole
     assert with_change < 0.7 * rest
 
@@ -172,7 +174,7 @@ def test_tyre_force_on_a_slope_equals_that_of_the_same_acceleration():
     assert np.abs(motion.axle.traction_acceleration() - want)[fast].max() < 0.3
     assert np.ptp(G * there.slope[fast]) > 0.5
     # here the body axes are those of the road
-    assert np.abs(motion.lean_accelerations[:, 0] - want)[fast].max() < 0.3
+    assert np.abs(motion.pitch_lean[:, :2].sum(axis=1) - want)[fast].max() < 0.3
 
 
 def test_truth_with_an_accelerometer_scale_error_satisfies_the_equations(perfect):
@@ -196,14 +198,14 @@ def test_scale_is_that_of_the_path_for_any_body_direction():
     """A squat of 0.1 rad per m/s^2 rotates the path in the body frame but keeps its length."""
     _, problem, state = at_truth(scenario='town')
     c = np.zeros(layout.M)
-    c[layout.BODY_LEAN.start] = 0.1
+    c[layout.PITCH_LEAN][:2] = 0.1
     unmoved = np.zeros((len(state.t), layout.SIZE_WITHOUT_SLOW))
     level, leaning = (Equations(problem, state.updated(unmoved, step)).factors['motion'].motion
                       for step in (np.zeros(layout.M), c))
     straight = np.abs(level.sums.mean_rate[:, 2]) < 1e-3
     # below walking speed the direction of travel is unknown
     walks = np.linalg.norm(level.displacement_by_state, axis=1) > WALK_SPEED * level.T[:, 0]
-    hard = straight & walks & (np.abs(level.lean_accelerations[:, 0]) > 0.5)
+    hard = straight & walks & (np.abs(level.pitch_lean[:, :2].sum(axis=1)) > 0.5)
     assert hard.sum() > 10
     ahead = (level.f_n + level.f_n_end) / 2
     length, other = (np.einsum('ki,ki->k', x.wheel_displacement, ahead)[hard]

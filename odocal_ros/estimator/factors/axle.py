@@ -109,14 +109,15 @@ class Axle:
         path = np.linalg.norm(self.v_n, axis=1) * np.gradient(self.state.t)
         return separate_tilts(self.state.C_nb[:, 2] @ axis_b, acceleration, path)
 
-    def lean_accelerations(self, mean_rate: Floats) -> Floats:
+    def lean_accelerations(self, mean_rate: Floats) -> tuple[Floats, Floats]:
         """
-        Return the signals of BODY_LEAN in each interval: (K, 4).
+        Return the signals of PITCH_LEAN and YAW_LEAN in each interval: (K, 3) and (K, 2).
 
         mean_rate : (K, 3) rad/s in b, mean turn rates.
 
-        Acceleration forward and left, including the components of gravity along a slope and a
-        bank, m/s^2, and their rates of change, m/s^3.
+        Of the pitch: forward acceleration by traction, by braking, m/s^2, and the rate of change
+        of their sum, m/s^3. Of the yaw: acceleration to the left and its rate of change. They
+        include the components of gravity along a slope and a bank.
         """
         T, speed = np.diff(self.state.t), self._forward_speed(self.v_n)
         # by speed and turn rate: a velocity difference of the axle has the noise of two turn rates
@@ -124,9 +125,13 @@ class Axle:
         left = (speed[1:] + speed[:-1]) / 2 * (mean_rate @ self.state.C_bv[:, 2])
         bank, _ = self.rolls()
         left += G * (bank[1:] + bank[:-1]) / 2
-        force = np.stack([np.diff(speed) / T + G * self._slope(), left], -1)
-        jerk = np.gradient(force, axis=0) / T[:, None] if len(T) > 1 else np.zeros_like(force)
-        return np.concatenate([force, jerk], axis=1)
+        forward = np.diff(speed) / T + G * self._slope()
+        # the suspension of an axle reacts differently to its drive and to its brakes
+        traction = np.where(forward * (speed[1:] + speed[:-1]) > 0, forward, 0.0)
+        forward_jerk, left_jerk = (np.gradient(x) / T if len(T) > 1 else np.zeros_like(x)
+                                   for x in (forward, left))
+        return (np.stack([traction, forward - traction, forward_jerk], -1),
+                np.stack([left, left_jerk], -1))
 
     def traction_acceleration(self) -> Floats:
         """Return the acceleration due to traction (positive) and braking, (S11): (K,) m/s^2."""

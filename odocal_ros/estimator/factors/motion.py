@@ -33,7 +33,7 @@ BOUNCE_INTERVALS = 5    # judgement: a slope less their mean is that of a bounce
 # attributes of Motion with a row for each interval
 INTERVAL_ATTRIBUTES = (
     'T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'displacement', 'wheel_displacement', 'by_delay',
-    'by_speed_offset', 'lean_accelerations', 'by_tilt', 'rate_n', 'level_left',
+    'by_speed_offset', 'pitch_lean', 'yaw_lean', 'by_tilt', 'rate_n', 'level_left',
     'half_pitch_variance', 'up_n', 'slope_gradient', 'tyre_signals', 'scale_ratio',
     'displacement_by_state', 'residual')
 
@@ -141,16 +141,19 @@ class Motion:
         return self.by_tilt @ self.state.constants[layout.BODY_TILT]
 
     @property
+    def _leans(self) -> tuple[tuple[Floats, slice], ...]:
+        return (self.pitch_lean, layout.PITCH_LEAN), (self.yaw_lean, layout.YAW_LEAN)
+
+    @property
     def lean_angles(self) -> Floats:
-        """Return pitch and yaw of the forward axis from BODY_LEAN, (S12): (2, K) rad."""
-        lean = self.lean_accelerations * self.state.constants[layout.BODY_LEAN]
-        out: Floats = lean.reshape(-1, 2, 2).sum(axis=1).T
-        return out
+        """Return pitch and yaw of the forward axis by PITCH_LEAN, YAW_LEAN, (S12): (2, K) rad."""
+        c = self.state.constants
+        return np.stack([signals @ c[columns] for signals, columns in self._leans])
 
     def _vary_axis(self) -> Floats:
         """Return K delta d of (S12), (K, 3), and set the signals of (S11) and (S12)."""
         state, T, c = self.state, self.T, self.state.constants
-        self.lean_accelerations = self.axle.lean_accelerations(self.sums.mean_rate)
+        self.pitch_lean, self.yaw_lean = self.axle.lean_accelerations(self.sums.mean_rate)
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         self.t_middle = (state.t[1:] + state.t[:-1]) / 2
         self.tyre_signals = tyre_signals_at(
@@ -265,10 +268,9 @@ class Motion:
         pitch, yaw = self.lean_angles
         by_roll = state.scale * (np.outer(pitch, -self.left) - np.outer(yaw, self.up))
         J_c[:, D, layout.MEAN_ROLL] -= rotate(C @ s.S, by_roll)
-        for i, axis in enumerate((self.up, -self.left)):
+        for axis, (signals, columns) in zip((self.up, -self.left), self._leans, strict=True):
             by_angle = C @ s.S @ (state.scale * axis)
-            columns = slice(layout.BODY_LEAN.start + i, layout.BODY_LEAN.stop, 2)
-            J_c[:, D, columns] = -by_angle[:, :, None] * self.lean_accelerations[:, None, i::2]
+            J_c[:, D, columns] = -by_angle[:, :, None] * signals[:, None]
         J_c[:, D, layout.BODY_TILT] = -self.by_tilt
         J_c[:, D, layout.ODO_ARM] = swing @ state.C_bv
         if self.by_speed_offset is not None:
