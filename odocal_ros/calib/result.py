@@ -17,7 +17,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason, SEVERITY, Verdict, verdict_of
 
 # keys of a result in calibration.json that are not estimates
-NOT_ESTIMATES = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
+NOT_ESTIMATES = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time', 'scale_by_curvature',
                            'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
                            'pitch_mounting_angle_housing_sigma'})
 AS_SENT = 'scale_factor_as_sent'     # of speeds as published, without the correction of steps

@@ -18,7 +18,7 @@ from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
 from odocal_ros.nav.rotations import matrix_from_rpy, rotate, transpose
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.settings.nominal import G, GRADES, TURN_ON, with_grade_by_noise
+from odocal_ros.settings.nominal import GRADES, TURN_ON, with_grade_by_noise
 from odocal_ros.sim.draw import draw_vehicle
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real_effects import RealEffects
@@ -259,39 +259,6 @@ def test_vehicle_effects_beside_the_values_are_reported():
     clean = reason_texts(smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config))
     assert not {Code.FIXES_SMOOTHED, Code.FIXES_NOISIER_THAN_SAID, Code.LEVER_ARM_OFF,
                 Code.SCALE_VARIES, Code.IMU_AXES_SKEW} & set(clean)
-
-
-def test_scale_that_decreases_with_speed_is_not_attributed_to_tyres():
-    _, config, leg = made(scenario='town', duration=300.0, imu_grade='industrial', seed=4,
-                          fix_noise='rtk', real=RealEffects(speed_law=-0.006))
-    falls = next(r for r in smooth(leg, config).reasons if r.code is Code.SCALE_VARIES)
-    assert re.search('changes by -.* from low to high speed', falls.text)
-    assert falls.remedy.startswith('Possible causes: truncated speed values')
-
-
-@pytest.mark.parametrize('driven', [True, False])
-def test_tyre_slip_in_one_direction_keeps_the_mean_scale_correct(driven):
-    """A wheel without drive slips only in braking: half a slope per direction is 90 ppm."""
-    drive, config, leg = made(**TOWN | {
-        'fix_noise': 'rtk', 'fix_sigma': 0.01,
-        'real': RealEffects(tyre_slip=0.035, driven=driven)})
-    method = smooth(leg, config)
-    assert off(method, drive) < 3.3
-    assert method.estimates['scale_factor'].sigma / drive.truth.scale < 60e-6
-    assert Code.WHEEL_SLIP not in {r.code for r in method.reasons}
-
-
-def test_brakes_pitch_the_body_with_a_slope_of_their_own():
-    """A body that dives by 1.8 deg/g and squats by 0.8: one slope moves the pitch by 1.5 sigma."""
-    dive, squat = 0.018 / G, 0.014 / G      # rad per m/s^2, the first in addition
-    drive, config, leg = made(**TOWN | {'duration': 400.0, 'fix_noise': 'rtk', 'fix_sigma': 0.01,
-                                        'imu_grade': 'tactical', 'real': RealEffects(
-                                            squat=squat, brake_dive=dive)})
-    found = smooth(leg, config)
-    assert off(found, drive, 'pitch_mounting_angle') < 3.0
-    for name, true in (('squat', squat), ('dive', squat + dive)):
-        value = found.details[name]
-        assert abs(value['value'] + true) < 3.0 * value['sigma'] < dive / 2
 
 
 def test_slow_drive_converges_to_the_correct_scale():

@@ -82,7 +82,7 @@ def test_turn_is_not_treated_as_braking():
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3,
                                  real=RealEffects(tyre_slip=stiff, driven=True))
     c = state.constants.copy()
-    c[layout.TYRES][2:] = 2 * stiff / G, stiff / G
+    c[layout.TYRES][2:4] = 2 * stiff / G, stiff / G
     state = replace(state, constants=c)
     along = Equations(problem, state).factors['motion'].raw[:, 15]
     speed = np.linalg.norm(state.v_n, axis=1)

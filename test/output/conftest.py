@@ -58,11 +58,12 @@ SMOOTHED = {
     'widened': 1.0, 'noise': {
         'along': 0.003, 'along_hard': 0.004, 'side': 0.002, 'side_turn': 0.005, 'up': 0.002},
     'odometer': {'reading': 0.25, 'period': 0.1, 'speed_step': 0.0, 'hard': 0.25, 'speed': 8.0,
-                 'fastest': 14.0, 'turn_rate': 0.06, 'fastest_turn': 0.3, 'square_speed': 80.0},
+                 'fastest': 14.0, 'turn_rate': 0.06, 'fastest_turn': 0.3, 'square_speed': 80.0,
+                 'half_squared_curvature': 0.0},
     'wheels': {side: {'ratio': 1.0, 'ratio_sigma': 1e-6, 'y': 0.8, 'y_sigma': 3e-4,
                       'walk': (1e-3, 2e-3, 3e-3)} for side in ('left', 'right')},
     **{name: {'value': 0.0, 'sigma': 0.0} for name in (
-        'scale_by_speed', 'sideslip', 'speed_offset')},
+        'scale_by_speed', 'scale_by_curvature', 'sideslip', 'speed_offset')},
     'gyro_scale_z': {'value': 0.002, 'sigma': 1e-4}, 'gyro_scale_x': {'value': 0.0, 'sigma': 1e-2},
     'posterior_to_prior': {'gyro_scale_z': 0.1, 'gyro_scale_x': 0.99},
     'accelerometer_bias': {axis: {'value': 0.01, 'sigma': 0.02, 'ratio': ratio}

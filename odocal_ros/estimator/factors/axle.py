@@ -140,21 +140,22 @@ class Axle:
         by_slope: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + by_slope
 
-    def means_by_path(self, sums: Intervals) -> Floats:
-        """Return the means of ``tyre_signals_at`` over a leg, weighted by path: (4,)."""
+    def tyre_signals(self, sums: Intervals) -> tuple[Floats, Floats]:
+        """Return the signals of TYRES in each interval, (K, 5), and their means by path, (5,)."""
         state = self.state
         path = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
-        share = path / max(path.sum(), 1e-9)
-        mean: Floats = share @ tyre_signals_at(path / sums.T, t - state.t[0],
-                                               self.traction_acceleration())
-        return mean
+        signals = tyre_signals_at(path / sums.T, t - state.t[0], self.traction_acceleration(),
+                                  sums.mean_rate @ state.C_bv[:, 2])
+        return signals, path / max(path.sum(), 1e-9) @ signals
 
 
-def tyre_signals_at(speed: Floats, t: Floats, acceleration_along: Floats) -> Floats:
-    """Return the signals of TYRES, x of (S11): (..., 4); t : s since the start of the leg."""
+def tyre_signals_at(speed: Floats, t: Floats, acceleration_along: Floats,
+                    turn_rate: Floats) -> Floats:
+    """Return the signals of TYRES, x of (S11): (..., 5); t : s since the start of the leg."""
     # m/s^2, 1/m: acceleration that rolling and air resistance take from a car at constant speed
     force = acceleration_along + 0.1 + 1e-4 * speed**2
     warm = WARM_TIME * (1 - np.exp(-t / WARM_TIME))
     return np.stack([speed**2 / (2 * FAST_SPEED), warm, np.maximum(force, 0.0),
-                     np.minimum(force, 0.0)], -1)
+                     np.minimum(force, 0.0),
+                     turn_rate**2 / (2 * np.maximum(speed**2, WALK_SPEED**2))], -1)

@@ -17,7 +17,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
-from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at, WALK_SPEED
+from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
 from odocal_ros.estimator.factors.body_tilt import BodyTilt
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
@@ -152,13 +152,11 @@ class Motion:
 
     def _vary_axis(self) -> Floats:
         """Return K delta d of (S12), (K, 3), and set the signals of (S11) and (S12)."""
-        state, T, c = self.state, self.T, self.state.constants
+        state, c = self.state, self.state.constants
         self.pitch_lean, self.yaw_lean = self.axle.lean_accelerations(self.sums.mean_rate)
-        speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         self.t_middle = (state.t[1:] + state.t[:-1]) / 2
-        self.tyre_signals = tyre_signals_at(
-            speed, self.t_middle - state.t[0],
-            self.axle.traction_acceleration()) - self.axle.means_by_path(self.sums)
+        tyre_signals, self.tyre_means = self.axle.tyre_signals(self.sums)
+        self.tyre_signals = tyre_signals - self.tyre_means
         self.half_pitch_variance = np.maximum(
             self.left @ self.angle_covariances @ self.left, 0.0) / 2
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES, None] \

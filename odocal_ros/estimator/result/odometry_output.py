@@ -19,6 +19,7 @@ from odocal_ros.calib.result import AS_SENT, Calibration, Estimate, MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
+from odocal_ros.estimator.factors.axle import WALK_SPEED
 from odocal_ros.estimator.factors.interval_noise import accelerating_and_turning, TURNING_RATE
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import Fit
@@ -38,7 +39,8 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, marginals: Jo
     Return ``odometer`` and ``accelerometer_bias``, as details of a method.
 
     odometer: sigma of a reading in scale units, period s, step of a quantised speed in scale units
-    per s, share of the motion with acceleration, speeds m/s and turn rates rad/s in motion.
+    per s, share of the motion with acceleration, speeds m/s and turn rates rad/s in motion,
+    mean of half the squared curvature over the path, 1/m^2.
     Biases at the start of the leg in b, m/s^2. factor : on the sigmas of the fit.
     """
     motion = fit.weighted[MotionRows].motion
@@ -57,7 +59,9 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, marginals: Jo
         'hard': float(accelerating_and_turning(motion)[0][moving].mean()),
         'speed': float(np.sqrt(np.mean(speed**2))), 'fastest': float(speed.max()),
         'turn_rate': float(np.sqrt(np.mean(rate**2))), 'fastest_turn': float(rate.max()),
-        'square_speed': float(speed @ speed**2 / speed.sum()) if speed.any() else 0.0}
+        'square_speed': float(speed @ speed**2 / speed.sum()) if speed.any() else 0.0,
+        'half_squared_curvature': float(motion.tyre_means[layout.SCALE_BY_CURVATURE
+                                                          - layout.TYRES.start])}
     sigma = np.sqrt(np.diagonal(marginals[0])[BA]) * factor
     ratio = sigma / fit.initial_priors.accel_bias_sigma
     biases = zip('xyz', fit.state.accel_bias[0], sigma, ratio, strict=True)
@@ -108,7 +112,8 @@ def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -
     # scale_by_speed: the slope at FAST_SPEED
     out: dict[str, Any] = {
         layout.CONSTANTS[i]: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
-        for i, unit in ((layout.SCALE_BY_SPEED, '1/(m/s)'), (layout.SCALE_BY_TIME, '1/s'))}
+        for i, unit in ((layout.SCALE_BY_SPEED, '1/(m/s)'), (layout.SCALE_BY_TIME, '1/s'),
+                        (layout.SCALE_BY_CURVATURE, 'm^2'))}
     if grade is not None:
         for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):
             out[f'{name}_mounting_angle_housing_sigma'] = {'value': _housing_sigma(
@@ -189,19 +194,23 @@ class TwistNoise:
         arm_x, arm_y = (np.square(self._estimate(f'odometer_lever_arm_{axis}')).sum()
                         for axis in 'xy')
         by_sideslip = _mean_square(leg['sideslip']) * (v**2 * w)**2
-        constant = np.array([self._scale_variance(leg, v) + arm_y * w**2,
+        constant = np.array([self._scale_variance(leg, v, w) + arm_y * w**2,
                              by_sideslip + arm_x * w**2, 0.0])
         coarse = (K * odometer['speed_step'])**2 / 12 * max(steps or 1.0, 1.0)**2 + (
             (factor - K) / K * v - K * leg['speed_offset']['value'])**2 * (factor != K)
         return np.append(white + constant + [coarse, 0.0, 0.0],
                          self._turn_rate(leg, v, w, per_level, reading))
 
-    def _scale_variance(self, leg: dict[str, Any], v: float) -> float:
-        """Return the variance of the speed from the scale: its sigma and its change with speed."""
+    def _scale_variance(self, leg: dict[str, Any], v: float, w: float) -> float:
+        """Return the variance of the speed from the scale: its sigma, its change from the mean."""
         scale, sigma = self._estimate('scale_factor')
-        by_speed = _mean_square(leg['scale_by_speed'])
-        change = (v**2 - leg['odometer']['square_speed']) / (2 * FAST_SPEED)
-        return float(v**2 * ((sigma / scale)**2 + by_speed * change**2))
+        by_speed, by_curvature = (_mean_square(leg[f'scale_by_{signal}'])
+                                  for signal in ('speed', 'curvature'))
+        square = (v**2 - leg['odometer']['square_speed']) / (2 * FAST_SPEED)
+        curvature = w**2 / (2 * max(v**2, WALK_SPEED**2)) - leg['odometer'][
+            'half_squared_curvature']
+        return float(v**2 * ((sigma / scale)**2 + by_speed * square**2
+                             + by_curvature * curvature**2))
 
     def _turn_rate(self, leg: dict[str, Any], v: float, w: float, per_level: float,
                    reading: float) -> float:

@@ -39,6 +39,9 @@ MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 SPEED_SCALE_REMEDY = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
                       'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
                       'Use wheel pulses, or a wheel that is not driven.')
+STEERED_REMEDY = ('Likely cause: the odometer counts wheels that steer, alone or in a mean; in '
+                  'turns they travel farther. Use wheels that do not steer, or calibrate on a '
+                  'drive with as many turns as the later ones.')
 # judgement: variance factor of a bias walk that is a step: 480 and more, without at most 7.3
 # (docs/decisions/0016)
 STEP_VARIANCE = 100.0
@@ -159,17 +162,24 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
 
 def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
-    signals, texts, remedy = fit.weighted[MotionRows].motion.tyre_signals, list[str](), ''
-    for i, interval in ((layout.SCALE_BY_SPEED, 'from low to high speed'),
-                        (layout.SCALE_BY_TIME, 'from start to end')):
-        change, change_sigma = np.array([fit.state.constants[i], sigma[i]]) * np.ptp(
-            signals[:, i - layout.TYRES.start])
+    motion, c = fit.weighted[MotionRows].motion, fit.state.constants
+    straight = -100 * (c[layout.TYRES] * motion.tyre_means)[-1]
+    texts, remedies = list[str](), list[str]()
+    for i, interval, remedy_if_less in (
+            (layout.SCALE_BY_SPEED, 'from low to high speed', SPEED_SCALE_REMEDY),
+            (layout.SCALE_BY_TIME, 'from start to end', ''),
+            (layout.SCALE_BY_CURVATURE,
+             f'from straight travel ({straight:+z.3f} % from the mean) to the tightest turn',
+             STEERED_REMEDY)):
+        signal = motion.tyre_signals[:, i - layout.TYRES.start]
+        change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(signal)
         if abs(change) > max(REMARK_SIGMAS * change_sigma, MIN_REPORTED_CHANGE):
             texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {interval}')
-            if i == layout.SCALE_BY_SPEED and change < 0:
-                remedy = SPEED_SCALE_REMEDY
+            remedies.append(remedy_if_less if change < 0 else '')
+    if not texts:
+        return []
     return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(texts)}; the stated '
-                   'value is the mean over this leg', remedy)] if texts else []
+                   'value is the mean over this leg', ' '.join(filter(None, remedies)))]
 
 
 def _bias_step_reasons(fit: Fit) -> list[Reason]:
