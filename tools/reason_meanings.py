@@ -111,10 +111,11 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'the IMU frame: the body frame is not forward-left-up. Or a level axis of the '
         'accelerometer has the wrong sign, as the accelerations in turns show, or the IMU was '
         'moved in the vehicle by 45 deg or more.',
-        Code.IMU_WORSE_THAN_GRADE: 'IMU errors are larger than its grade. The smoother uses the '
-        'noise estimated from the drive instead. Sigmas that only depend on the grade, such as '
-        'those of the other methods, are too small. Or errors are far larger for some seconds: '
-        'vibration above half the rate of the IMU is aliased to low frequencies.',
+        Code.IMU_WORSE_THAN_GRADE: 'IMU errors are larger than its grade (MEMS sold as tactical '
+        'have the gyro noise of `industrial`). The smoother uses the noise estimated from the '
+        'drive instead. Sigmas that only depend on the grade, such as those of the other methods, '
+        'are too small. Or errors are far larger for some seconds: vibration above half the rate '
+        'of the IMU is aliased to low frequencies.',
         Code.IMU_SATURATED: 'The largest value of an axis is repeated: the sensor stops at the '
         'limit of its range, 2 g or 16 g for an accelerometer. Potholes and a hard mount cause '
         'this. The noise levels include these samples.',

@@ -115,8 +115,10 @@ class OdometerConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ImuConfig:
-    grade: str = setting('consumer', choices=GRADES, about='Quality of the IMU: gyro noise of '
-                         '0.3, 0.15, 0.012, 0.001 deg/√h. The settings below override values.')
+    grade: str = setting('consumer', choices=GRADES, about=(
+        'Quality of the IMU by its gyro noise (angle random walk): 0.3, 0.15, 0.012, 0.001 '
+        'deg/√h. Tactical MEMS such as STIM300 and HG1700 (0.15, 0.125) are industrial here. '
+        'The settings below override values.'))
     frame_id: str = setting('', read_only=True, about=(
         "Use only messages of the IMU topic with this frame_id; '': the topic must carry one "
         'IMU.'))
