@@ -188,7 +188,7 @@ def _parameter_sigmas(method: MethodResult) -> Floats:
 
 
 def _information(method: MethodResult) -> MarginalInformation:
-    assert method.marginal is not None, 'a fit has one'
+    assert method.marginal is not None, 'a fit has marginal information'
     return method.marginal
 
 

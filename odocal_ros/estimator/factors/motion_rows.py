@@ -24,8 +24,7 @@ from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import ACCEL, BG, GYRO, MEAN_ROLL, P, State, V
 
-# by level
-BUDGET_SOURCES = {
+BUDGET_SOURCES = {      # names of the error sources, by level
     'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
     'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise', 'along_hard': 'travel_noise',
     'side': 'sideslip', 'side_turn': 'sideslip', 'up': 'vertical_motion',
@@ -37,8 +36,8 @@ class MotionRows(Factor):
     """
     Rows of the K intervals; a weighted copy has r (K, 18), J (K, 18, 2n + m), whiten (K, 18, 18).
 
-    Unit noises are recomputed when needed, some intervals at a time: stored, they would take a
-    third of the memory of the derivatives.
+    r : residuals, J : derivatives, both multiplied by whiten. Unit noises are recomputed when
+    needed, some intervals at a time: stored, they would take a third of the memory of J.
     """
 
     name = 'motion'

@@ -140,7 +140,7 @@ class SpeedSteps(PointRows):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         leg, state, points = problem.leg, point.state, point.points[self.name]
-        self.state, self.instants = state, _within(problem)
+        self.state, self.instants = state, _used_steps(problem)
         k, tau = points.interval, points.tau[:, None]
         # attitude at the keyframe before; attitude, velocity and forward axis at the point
         C = state.C_nb[k]
@@ -181,12 +181,12 @@ class SpeedSteps(PointRows):
 
     @classmethod
     def is_present(cls, problem: Problem) -> bool:
-        return problem.leg.uses_speed_steps and len(_within(problem).t) > 0
+        return problem.leg.uses_speed_steps and len(_used_steps(problem).t) > 0
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
         """Return the times of the steps, s, then the times at which the filter needs a speed."""
-        stamp, keyframes = _within(problem).t, problem.imu.t_keyframes
+        stamp, keyframes = _used_steps(problem).t, problem.imu.t_keyframes
         t = stamp - constants[layout.ODO_DELAY] - constants[layout.ODO_CLOCK] * stamp
         delays = filter_time(constants) * FILTER_AGES
         return np.concatenate([t, np.clip(
@@ -231,7 +231,7 @@ class SpeedSteps(PointRows):
         return J[:, None], J_c[:, None]
 
 
-def _within(problem: Problem) -> SpeedInstants:
+def _used_steps(problem: Problem) -> SpeedInstants:
     """Return the steps of the speed between the first and the last keyframe."""
     t, coarse = problem.imu.t_keyframes, problem.leg.travel.coarse
     assert coarse is not None, 'uses_speed_steps'

@@ -92,7 +92,7 @@ class SlowError(factor.Factor):
         components = {'slow': (float(squares[:2].sum()), float(expected[:2].sum())),
                       'slow_up': (float(squares[2]), float(expected[2]))}
         if not self.time_is_fixed:
-            components['correlation_time'] = self._time(
+            components['correlation_time'] = self._time_component(
                 r * s[:-1] + cross - a * before, square - redundancy, first + first_variance - 1)
         return components
 
@@ -123,7 +123,8 @@ class SlowError(factor.Factor):
         return np.stack([np.repeat(np.take_along_axis(x, axis, axis=1), length, axis=0)
                          for x in (z, observed)])
 
-    def _time(self, product: Floats, excess: Floats, begin: Floats) -> tuple[float, float]:
+    def _time_component(self, product: Floats, excess: Floats,
+                        begin: Floats) -> tuple[float, float]:
         """Return Q and E of the logarithm of the correlation time; Q - E is its score."""
         # the expected score of the complete data (Fisher's identity). Expected values: product,
         # driving noise times the error before; excess, begin: squares of noise and of the first
@@ -139,19 +140,19 @@ class SlowError(factor.Factor):
         # q of a density is the error s itself, as the covariance is proportional to it
         s = self.state.slow_n
         axes = {'slow': np.array([1.0, 1.0, 0.0]), 'slow_up': np.array([0.0, 0.0, 1.0])}
-        g, q = ([x * axis for axis in axes.values()] for x in (self._precision(), s))
+        g, q = ([x * axis for axis in axes.values()] for x in (self._weighted_error(), s))
         names = list(axes)
         if not self.time_is_fixed:
-            by_time = self._by_time()
+            by_time = self._weighted_error_by_time()
             g.append(by_time)
-            q.append(self._process(by_time))
+            q.append(self._covariance_product(by_time))
             names.append('correlation_time')
         columns = out.columns(names)
         for i, g_i in zip(columns, g, strict=True):
             out.g[:, SLOW, i] += g_i
         out.q_products[np.ix_(columns, columns)] += [[(a * b).sum() for b in g] for a in q]
 
-    def _precision(self) -> Floats:
+    def _weighted_error(self) -> Floats:
         """Return the inverse covariance of the process times the error: (N, 3)."""
         s, noise = self.state.slow_n, self.residual() / self.noise_variance
         out = np.zeros_like(s)
@@ -160,8 +161,8 @@ class SlowError(factor.Factor):
         out[:-1] -= self.decay * noise
         return out
 
-    def _by_time(self) -> Floats:
-        """Return minus the derivative of ``_precision`` by the log correlation time: (N, 3)."""
+    def _weighted_error_by_time(self) -> Floats:
+        """Return minus the derivative of ``_weighted_error`` by the log of the time: (N, 3)."""
         s, r = self.state.slow_n, self.residual()
         noise = (self.decay_by_time * s[:-1] + r * self.log_variance_by_time) / self.noise_variance
         out = np.zeros_like(s)
@@ -170,8 +171,8 @@ class SlowError(factor.Factor):
         out[:-1] += self.decay_by_time * r / self.noise_variance - self.decay * noise
         return out
 
-    def _process(self, g: Floats) -> Floats:
-        """Return the covariance of the process times (N, 3): it solves ``_precision``."""
+    def _covariance_product(self, g: Floats) -> Floats:
+        """Return the covariance of the process times (N, 3): it solves ``_weighted_error``."""
         N, out = len(g), np.empty_like(g)
         for axis in range(3):
             a, q = self.decay[:, 0], np.append(self.variance[axis], self.noise_variance[:, axis])

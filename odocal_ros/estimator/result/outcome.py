@@ -89,7 +89,7 @@ def make_result(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
     ratio = {layout.CONSTANTS[i]: float(posterior.sigma_ratio[i])
              for i in (*OPTIONAL, *IMPERFECTION_CONSTANTS)} | bias_ratio
     reasons += [*refusals, *wheel_reasons,
-                *_without_estimate(problem, fit, sigma, ratio, estimates)]
+                *_not_observable_reasons(problem, fit, sigma, ratio, estimates)]
     reasons += assumed_noise_reasons(problem, fit.levels)
     reasons += check_limits(estimates, leg.nominal_scale, config)
     sources, information = _budget(leg, fit, marginals, posterior)
@@ -156,7 +156,7 @@ def _estimate_gyro_bias(fit: Fit, marginals: JointMarginals,
                 zip(names, ratio.tolist(), strict=True))
 
 
-def _without_estimate(problem: Problem, fit: Fit, sigma: Floats, ratio: Mapping[str, float],
+def _not_observable_reasons(problem: Problem, fit: Fit, sigma: Floats, ratio: Mapping[str, float],
                       estimates: Mapping[str, Estimate]) -> list[Reason]:
     """Return the reason for constants without an estimate, but those of LEVER_ARM_OFF."""
     reported = {layout.CONSTANTS[i]

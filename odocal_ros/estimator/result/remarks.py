@@ -112,9 +112,9 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, sigma_ratio: Floats,
 def _imu_reasons(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
     """Return the reasons for scale and axis errors of the IMU far beyond its grade."""
     reasons = []
-    usual = imperfection_sigmas(grade_of(config.imu))
-    error = np.zeros(len(c))        # in sigmas of the grade
-    error[layout.IMPERFECTIONS] = np.abs(c[layout.IMPERFECTIONS]) / np.maximum(usual, 1e-300)
+    grade_sigmas = np.maximum(imperfection_sigmas(grade_of(config.imu)), 1e-300)
+    error = np.zeros(len(c))        # of significant constants, in sigmas of the grade
+    error[layout.IMPERFECTIONS] = np.abs(c[layout.IMPERFECTIONS]) / grade_sigmas
     error *= np.abs(c) > REMARK_SIGMAS * sigma
     skew = float(np.linalg.norm(error[ACCEL_AXES]))
     if skew > IMU_ERROR_LIMIT:
