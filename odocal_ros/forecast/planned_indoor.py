@@ -140,7 +140,10 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
     ideal = planned_methods.ideal_samples(drive, sigmas, planned_methods.keyframe_spacing(drive))
     leg = ideal.leg
     half_difference = np.interp(leg.t_imu, drive.t, drive.yaw - drive.yaw[0]) * robot.width / 2
-    used = _fixes_at_rests(leg.t_fix, motion) if robot.at_rests else slice(None)
+    used = np.arange(len(leg.t_fix))
+    if robot.at_rests:      # the fixes nearest to the middle of each rest
+        t_middle = motion.rests.mean(axis=1) - motion.t[np.argmax(motion.moving) - 1]
+        used = np.abs(leg.t_fix[:, None] - t_middle).argmin(axis=0)
     leg = replace(
         leg, t_fix=leg.t_fix[used], fixes_n=leg.fixes_n[used],
         covariance_n=leg.covariance_n[used],
@@ -175,12 +178,6 @@ def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> Metho
             estimates[name] = replace(estimates[name], sigma=float(np.hypot(sigma, slip_sigma)))
     return replace(method, estimates=estimates, details=method.details | {
         'ratio_sigma': float(ratio)})
-
-
-def _fixes_at_rests(t_fix: Floats, motion: RobotMotion) -> Ints:
-    """Return the indices of the fixes nearest to the middle of each rest; t_fix from the start."""
-    middle = motion.rests.mean(axis=1) - motion.t[np.argmax(motion.moving) - 1]
-    return np.asarray(np.abs(t_fix[:, None] - middle).argmin(axis=0))
 
 
 def predict_robot(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:

@@ -95,11 +95,7 @@ def _better_sensors(plan: 'Planned') -> Iterator[tuple[str, Sigmas]]:
 
 
 def _until_farthest(drive: PlannedDrive, min_rest: float) -> PlannedDrive | None:
-    """
-    Return the drive up to its farthest point from the start, None if that is the end.
-
-    min_rest : s of a standstill; the drive ends with one that is there, else with DEFAULT_REST.
-    """
+    """Return the drive up to its farthest point, None: its end; min_rest : s of a standstill."""
     inside = drive.t >= 0
     # east + i north, from steps of travel in the direction of the yaw
     position = np.cumsum(np.gradient(drive.travel[inside]) * np.exp(1j * drive.yaw[inside]))

@@ -8,6 +8,7 @@ Each function draws one effect from a random generator and returns the values th
 functions are in EFFECTS and RARE, by the name that ``odocal simulate --effect`` accepts.
 """
 
+from collections.abc import Callable
 import math
 
 import numpy as np
@@ -120,22 +121,11 @@ def odometer_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     return Effect(real={'odometer_jitter': 0.003}, options={'odometer_delay': delay})
 
 
-def speed_law(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Let tyres grow with the square of the speed."""
-    return Effect(real={'speed_law': lognormal(rng, 0.002, 0.6)})
-
-
 def warming(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Let tyres grow as they warm up."""
     factor = 0.5 if vehicle.grade == 'tactical' else 1.0
     return Effect(real={'warming': float(factor * rng.uniform(0.001, 0.004)),
                         'warming_time': lognormal(rng, 600.0, 0.4)})
-
-
-def slip(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Let tyres slip under traction and braking."""
-    return Effect(real={'tyre_slip': 1 / lognormal(rng, 30.0, 0.4),
-                        'driven': bool(rng.uniform() < 0.5)})
 
 
 def sideslip(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
@@ -159,11 +149,6 @@ def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
         arm = np.array(vehicle.options[f'{name}_lever_arm'])
         real[f'{name}_arm_error'] = flat(-arm if is_unmeasured else error)
     return Effect(real=real)
-
-
-def receiver_lag(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Filter positions as receivers do."""
-    return Effect(real={'receiver_lag': float(rng.uniform(0.01, 0.15))})
 
 
 def fix_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
@@ -208,38 +193,10 @@ def outages(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     return Effect(real={'drops': 0.01}, options={'outages': tuple(sorted(spans))})
 
 
-def fused_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Fuse an uncalibrated odometer into the fixes, as car head units do."""
-    return Effect(real={'receiver_odometer': float(rng.uniform(0.003, 0.02) * rng.choice((-1, 1))),
-                        'receiver_odometer_time': lognormal(rng, 20.0, 0.5)})
-
-
-def tracked_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Filter position and velocity, as receivers in vehicle mode do."""
-    return Effect(real={'receiver_tracking': float(rng.uniform(0.3, 1.0))})
-
-
-def held_speed(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Hold a published speed until it has changed by a step, as many buses do."""
-    return Effect(real={'speed_hold': KMH * float(rng.choice((0.2, 0.5)))},
-                  options=vehicle.speed_options)
-
-
-def filtered_speed(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Filter speeds by a low pass, like most speed signals of cars."""
-    return Effect(real={'speed_filter': float(rng.uniform(0.2, 0.6))},
-                  options=vehicle.speed_options | {'odometer_rate': 20.0})
-
-
 def clocks(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Stamp odometer and fixes by clocks with other rates than that of the IMU."""
     odometer, fix = rng.uniform(2e-5, 1e-4, 2) * rng.choice((-1, 1), 2)
     return Effect(real={'odometer_clock_rate': float(odometer), 'fix_clock_rate': float(fix)})
-
-
-def late_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Stamp fixes at reception, after a latency that varies."""
-    return Effect(real={'fix_jitter': float(rng.uniform(0.05, 0.1))}, options={'fix_delay': 0.25})
 
 
 def tunnels(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
@@ -249,12 +206,6 @@ def tunnels(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
         'tunnels': tuple((float(b), float(rng.uniform(20.0, 120.0))) for b in begins),
         'tunnel_odometer': float(rng.uniform(0.005, 0.02) * rng.choice((-1, 1))),
         'tunnel_heading': float(DEG * rng.normal())})
-
-
-def reflections(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
-    """Receive only reflections near a wall for half a minute, with slow onset and end."""
-    return Effect(real={'bursts': 20.0, 'burst_size': 12.0, 'burst_time': 30.0,
-                        'burst_onset': 10.0})
 
 
 def kerbs(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
@@ -274,10 +225,37 @@ def bias_steps(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
         'bias_step_at': float(rng.uniform(100.0, 300.0))})
 
 
-EFFECTS = {f.__name__: f for f in (
-    triads, g_sensitivity, bias, temperature, vibration, imu_stamps, grade,
-    coarse_speed, coarse_pulses, odometer_stamps, speed_law, warming, slip, sideslip, squat,
-    lever_arms, receiver_lag, fix_stamps, slow_errors, multipath, covariance, outages)}
+Draw = Callable[[np.random.Generator, Vehicle], Effect]
+EFFECTS: dict[str, Draw] = {draw.__name__: draw for draw in (
+    triads, g_sensitivity, bias, temperature, vibration, imu_stamps, grade, coarse_speed,
+    coarse_pulses, odometer_stamps, warming, sideslip, squat, lever_arms, fix_stamps, slow_errors,
+    multipath, covariance, outages)} | {
+    # tyres grow with the square of the speed
+    'speed_law': lambda rng, _: Effect(real={'speed_law': lognormal(rng, 0.002, 0.6)}),
+    # tyres slip under traction and braking
+    'slip': lambda rng, _: Effect(real={'tyre_slip': 1 / lognormal(rng, 30.0, 0.4),
+                                        'driven': bool(rng.uniform() < 0.5)}),
+    # receivers filter positions
+    'receiver_lag': lambda rng, _: Effect(real={'receiver_lag': float(rng.uniform(0.01, 0.15))})}
 # only with --effect NAME: receivers and buses of some vehicles
-RARE = {f.__name__: f for f in (fused_fixes, tracked_fixes, held_speed, filtered_speed,
-                                late_fixes, tunnels, reflections, kerbs, clocks, bias_steps)}
+RARE: dict[str, Draw] = {draw.__name__: draw for draw in (tunnels, kerbs, clocks, bias_steps)} | {
+    # an uncalibrated odometer is fused into the fixes, as in car head units
+    'fused_fixes': lambda rng, _: Effect(real={
+        'receiver_odometer': float(rng.uniform(0.003, 0.02) * rng.choice((-1, 1))),
+        'receiver_odometer_time': lognormal(rng, 20.0, 0.5)}),
+    # receivers in vehicle mode filter position and velocity
+    'tracked_fixes': lambda rng, _: Effect(real={
+        'receiver_tracking': float(rng.uniform(0.3, 1.0))}),
+    # a published speed is held until it has changed by a step, as on many buses
+    'held_speed': lambda rng, vehicle: Effect(
+        real={'speed_hold': KMH * float(rng.choice((0.2, 0.5)))}, options=vehicle.speed_options),
+    # speeds have passed a low pass, like most speed signals of cars
+    'filtered_speed': lambda rng, vehicle: Effect(
+        real={'speed_filter': float(rng.uniform(0.2, 0.6))},
+        options=vehicle.speed_options | {'odometer_rate': 20.0}),
+    # fixes are stamped at reception, after a latency that varies
+    'late_fixes': lambda rng, _: Effect(real={'fix_jitter': float(rng.uniform(0.05, 0.1))},
+                                        options={'fix_delay': 0.25}),
+    # near a wall the receiver has only reflections for half a minute, with slow onset and end
+    'reflections': lambda rng, _: Effect(real={'bursts': 20.0, 'burst_size': 12.0,
+                                               'burst_time': 30.0, 'burst_onset': 10.0})}

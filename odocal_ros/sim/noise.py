@@ -13,7 +13,8 @@ from odocal_ros.sim.options import SimOptions
 # s from the first IMU sample, so that no two topics sample together
 PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004, 'pressure': 0.005}
 CLOSURE_REMAINDER = 0.2     # judgement: share of the drift that remains after a loop closure
-TRANSPORT_DELAY = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measurement to arrival
+# judgement: from measurement to arrival
+TRANSPORT_DELAY_NS = {'imu': 500_000, 'fix': 50_000_000, 'heading': 10_000_000}
 
 
 def make_rng(seed: int, name: str) -> np.random.Generator:
@@ -52,11 +53,6 @@ def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floa
     n = int(np.floor((duration - phase) * rate + 1e-9)) + 1
     ns = np.rint(phase * 1e9 + np.arange(n) * (1e9 / rate)).astype(np.int64)
     return ns, ns * 1e-9
-
-
-def arrival_ns(stamp: Ints, topic: str) -> Ints:
-    """Return the arrival times of messages with given stamps, ns: (n,)."""
-    return stamp + round(TRANSPORT_DELAY[topic] * 1e9)
 
 
 def reference_drift(t: Floats, travel: Floats, options: SimOptions) -> Floats | float:

@@ -18,7 +18,7 @@ from odocal_ros.nav.geodesy import radii
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point_geodetic
-from odocal_ros.sim.noise import arrival_ns, gauss_markov, make_rng, PHASE, stamps
+from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, stamps, TRANSPORT_DELAY_NS
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real_effects import RealEffects
 
@@ -33,12 +33,10 @@ AGE_EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0)
 AGES = (AGE_EDGES[:-1, None] + np.diff(AGE_EDGES)[:, None] * (
     0.5 + np.array([-1, 1]) / 12**0.5)).ravel()
 AGE_LENGTHS = np.repeat(np.diff(AGE_EDGES) / 2, 2)
-# definition: weights of a first-order filter
-FIRST_ORDER = np.exp(-AGES) * AGE_LENGTHS
-FIRST_ORDER /= FIRST_ORDER.sum()
-# definition: of a second-order filter of position and velocity, damped by sqrt(1/2)
-SECOND_ORDER = np.exp(-AGES / 2**0.5) * np.cos(AGES / 2**0.5) * AGE_LENGTHS
-SECOND_ORDER /= SECOND_ORDER.sum()
+# definition: weights of a first-order filter, and of a second-order filter of position and
+# velocity, damped by sqrt(1/2)
+FIRST_ORDER, SECOND_ORDER = (weights / weights.sum() for weights in (
+    np.exp(-AGES) * AGE_LENGTHS, np.exp(-AGES / 2**0.5) * np.cos(AGES / 2**0.5) * AGE_LENGTHS))
 UP_RATIO = 2.0       # judgement: height errors over those of east and north
 # judgement: range of the rise and fall times of bursts, over their mean
 ONSET_RANGE = (0.5, 1.5)
@@ -260,5 +258,5 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     published = true * (1 + options.velocity_scale_error) + (
         error + is_outlier * OUTLIER_SIGMA * rng.standard_normal((len(t), 3)))
     stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
-    return VelocitySamples(stamp, arrival_ns(stamp, 'fix'), published,
+    return VelocitySamples(stamp, stamp + TRANSPORT_DELAY_NS['fix'], published,
                            np.full(published.shape, sigma**2))

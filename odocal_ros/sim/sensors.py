@@ -83,8 +83,9 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
         ns = real_sensors.delayed_stamps(ns, noise.make_rng(options.seed, 'real imu stamps'),
                                          real.imu_latency, real.imu_jitter, real.imu_batch)
     stamp = options.start_ns + ns
-    return samples.ImuSamples(stamp, noise.arrival_ns(stamp, 'imu'), w_i + gyro + gyro_drift,
-                              f_i + accel + accel_drift, q_ni, variance)
+    return samples.ImuSamples(
+        stamp, stamp + noise.TRANSPORT_DELAY_NS['imu'], w_i + gyro + gyro_drift,
+        f_i + accel + accel_drift, q_ni, variance)
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.HeadingSamples:
@@ -92,7 +93,7 @@ def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.Headin
     ns, t = noise.stamps(motion.duration, options.heading_rate, noise.PHASE['heading'])
     q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=ZEROS3), sigma, 'heading')
     stamp = options.start_ns + ns
-    return samples.HeadingSamples(stamp, noise.arrival_ns(stamp, 'heading'), q_nb,
+    return samples.HeadingSamples(stamp, stamp + noise.TRANSPORT_DELAY_NS['heading'], q_nb,
                                   np.full(len(t), sigma**2))
 
 
@@ -220,7 +221,7 @@ def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     n = len(t)
     stamp = options.start_ns + _delayed(ns, options, 'fix')
     sent = samples.FixSamples(
-        stamp, noise.arrival_ns(stamp, 'fix'), latitude, longitude, height + error[:, 2],
+        stamp, stamp + noise.TRANSPORT_DELAY_NS['fix'], latitude, longitude, height + error[:, 2],
         np.tile(np.diag(_stated_variances(options)), (n, 1, 1)), np.full(n, DIAGONAL_KNOWN),
         np.full(n, RTK_STATUS if options.fix_noise == 'rtk' else 0))
     received = np.ones(n, dtype=bool)
