@@ -142,14 +142,6 @@ def _residual_properties(n: int) -> Floats:
     return np.array(table).T
 
 
-class CounterChange(NamedTuple):
-    """A possible change of the counter; the least scatter comes first."""
-
-    scatter: float    # of the scale on each side, over the change
-    section: int      # in which the scale changes
-    factor: float     # counts per metre after the change over those before
-
-
 def counter_change_reasons(scales: Sections, t_fix: Floats,
                            distance: Floats) -> tuple[Reason, ...]:
     """
@@ -160,7 +152,7 @@ def counter_change_reasons(scales: Sections, t_fix: Floats,
     """
     known = np.flatnonzero(np.isfinite(scales.ratio) & (scales.ratio > 0))
     log_scale, sigma = np.log(scales.ratio[known]), scales.sigma[known]
-    candidates: list[CounterChange] = []
+    changes: dict[float, tuple[int, float]] = {}      # by scatter over change: section, factor
     for k in range(1, len(known) - 1):
         sides = [log_scale[:k], log_scale[k + 1:]]
         before, after = (np.median(side) for side in sides)
@@ -168,11 +160,11 @@ def counter_change_reasons(scales: Sections, t_fix: Floats,
         sigma_of_change = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
         if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * sigma_of_change,
                                      scatter / SIDE_SCATTER):
-            candidates.append(CounterChange(
-                scatter / abs(after - before), int(known[k]), float(np.exp(before - after))))
-    if not candidates:
+            changes.setdefault(scatter / abs(after - before), (
+                int(known[k]), float(np.exp(before - after))))
+    if not changes:
         return ()
-    _, section, factor = min(candidates)
+    section, factor = changes[min(changes)]      # with the least scatter on both sides
     begin, end = np.interp([scales.begin[section], scales.end[section]], distance, t_fix)
     text = f'after t = {begin:.0f} to {end:.0f} s the odometer counts '
     if not 1 / MAX_DECODING < factor < MAX_DECODING:
