@@ -18,7 +18,7 @@ from odocal_ros.nav.odometer import make_travel
 from odocal_ros.nav.receiver_filter import filter_error, MIN_LAG2, odometer_error
 from odocal_ros.screening.odometer_rows import with_gap_uncertainty
 from odocal_ros.sim.real_effects import RealEffects
-from odocal_ros.sim.wheels import held_until_step, quantized
+from odocal_ros.sim.wheels import hold_speed, published_speed
 
 KMH = 1 / 3.6
 T = np.arange(0.0, 600.0, 0.1)
@@ -154,7 +154,7 @@ def town(t):
 
 @pytest.mark.parametrize('scale', [1.0, 37.0])
 def test_a_held_speed_is_recognised_with_its_step(scale):
-    found = find_held_speed(AT, scale * held_until_step(town(AT), STEP))
+    found = find_held_speed(AT, scale * hold_speed(town(AT), STEP))
     # the least of many changes is a step plus the least change within a row
     assert STEP <= found.step / scale < 1.05 * STEP
     assert not found.truncation
@@ -162,7 +162,7 @@ def test_a_held_speed_is_recognised_with_its_step(scale):
 
 @pytest.mark.parametrize('value', [
     town(AT), town(AT) + 0.01 * np.random.default_rng(1).standard_normal(len(AT)),
-    np.repeat(town(AT[::5]), 5), quantized(town(AT), RealEffects(speed_step=1 / 3.6)),
+    np.repeat(town(AT[::5]), 5), published_speed(town(AT), RealEffects(speed_step=1 / 3.6)),
     np.zeros(len(AT)), np.full(len(AT), 5.0)],
     ids=['plain', 'noisy', 'repeated', 'whole km/h', 'standing', 'even'])
 def test_other_speeds_are_not_recognised_as_held(value):
@@ -172,7 +172,7 @@ def test_other_speeds_are_not_recognised_as_held(value):
 
 def test_a_held_speed_is_exact_at_changes_and_within_half_a_step_elsewhere():
     true = town(AT)
-    found = find_held_speed(AT, held_until_step(true, STEP))
+    found = find_held_speed(AT, hold_speed(true, STEP))
     assert_allclose(found.instants.value, np.interp(found.instants.t, AT, true), atol=1e-9)
     off = np.abs(found.value - true)[true > 0]
     # one row more where the speed changes direction within a step
@@ -182,7 +182,7 @@ def test_a_held_speed_is_exact_at_changes_and_within_half_a_step_elsewhere():
 
 def test_path_error_of_a_held_speed_is_that_of_its_cruises():
     true = town(AT)
-    held = held_until_step(true, STEP)
+    held = hold_speed(true, STEP)
     middle = make_travel(AT, held, RATE)[0].s[-1]
     whole, sent = (((x[1:] + x[:-1]) / 2 * np.diff(AT)).sum() for x in (true, held))
     # four cruises of 20 s, each uniform within a step: 3 sigmas
@@ -191,7 +191,7 @@ def test_path_error_of_a_held_speed_is_that_of_its_cruises():
 
 
 def test_a_held_speed_with_reversed_counts_has_the_other_side():
-    value = held_until_step(town(AT), STEP)
+    value = hold_speed(town(AT), STEP)
     path, back = make_travel(AT, value, RATE)[0], make_travel(AT, -value, RATE,
                                                               reversed_counts=True)[0]
     assert_allclose(back.s, path.s)
