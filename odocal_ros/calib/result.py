@@ -178,7 +178,7 @@ class Calibration:
         return verdict_of(self.reasons)
 
 
-def has_local_positions(legs: Iterable[LegResult]) -> bool:
+def has_local_fixes(legs: Iterable[LegResult]) -> bool:
     """Return True if the fixes of a leg are in a local frame: of SLAM, motion capture, ..."""
     return any(reason.code is Code.LOCAL_FRAME for leg in legs for reason in leg.reasons)
 

@@ -106,7 +106,7 @@ def _by_number_of_values(methods: dict[str, result.MethodResult],
 def _budgets(methods: dict[str, result.MethodResult],
              legs: tuple[result.LegResult, ...]) -> list[tuple[str, dict[str, Any]]]:
     """Return (method, error budget) of the methods that have one."""
-    local = result.has_local_positions(legs)
+    local = result.has_local_fixes(legs)
     return [(tables.label(name), table) for name, method in methods.items()
             if (table := tables.budget_table(method, local))]
 

@@ -53,7 +53,7 @@ def estimate_texts(name: str, estimate: result.Estimate) -> tuple[str, str, str]
 
 def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
     """Return the rows of the result: name, value in both units, relative sigma, method, cause."""
-    rows, local = [], result.has_local_positions(calibration.legs)
+    rows, local = [], result.has_local_fixes(calibration.legs)
     for name in calibration.estimates:
         estimate = texts.finite_estimate(calibration.estimates, name)
         if estimate.value is None:
@@ -91,7 +91,7 @@ def undetermined(calibration: result.Calibration) -> list[str]:
         if value is None and name != 'scale_ratio':
             has_axis = name[-2:] in ('_x', '_y', '_z')
             axes.setdefault(name[:-2] if has_axis else name, []).extend(name[-1] * has_axis)
-    local = result.has_local_positions(calibration.legs)
+    local = result.has_local_fixes(calibration.legs)
     return [f'{label(quantity, local)} {", ".join(names)}'.rstrip()
             for quantity, names in axes.items()]
 
@@ -110,7 +110,7 @@ def method_table(methods: dict[str, result.MethodResult],
         for method in methods.values():
             first, other, _ = estimate_texts(name, texts.finite_estimate(method.estimates, name))
             cells.append(('-', '') if name not in method.estimates else (first, other))
-        rows.append((label(name, result.has_local_positions(legs)), cells))
+        rows.append((label(name, result.has_local_fixes(legs)), cells))
     return {'heads': [label(name) for name in methods], 'rows': rows,
             'verdicts': [tables.shown_verdict(method, legs) for method in methods.values()],
             'reasons': [(label(name), reason) for name, method in methods.items()

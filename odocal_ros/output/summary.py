@@ -92,7 +92,7 @@ def driven_text(legs: tuple[result.LegResult, ...]) -> str:
 
 
 def _value_lines(calibration: result.Calibration, width: int) -> list[str]:
-    estimates, local = calibration.estimates, result.has_local_positions(calibration.legs)
+    estimates, local = calibration.estimates, result.has_local_fixes(calibration.legs)
     wheels, rotation = _wheel_lines(estimates), rotation_text(calibration, width)
     lines = _scale_lines(calibration)
     for name, label in _angles_of(estimates).items():
@@ -229,7 +229,7 @@ def _largest_error_lines(calibration: result.Calibration, width: int) -> list[st
         estimate = texts.finite_estimate(calibration.estimates, name)
         source, share = tables.largest_source(calibration.methods.get(estimate.method), name)
         if source and estimate.value is not None:
-            label = tables.source_label(source, result.has_local_positions(calibration.legs))
+            label = tables.source_label(source, result.has_local_fixes(calibration.legs))
             largest.append(f'{short_name}: {label} ({100 * share:.0f} %)')
     # lines are broken between the values only; 3: indent, and space after the label
     lines = textwrap.wrap('; '.join(largest).replace(' ', '\xa0').replace(';\xa0', '; '),
@@ -283,4 +283,4 @@ def _budget_lines(calibration: result.Calibration, width: int, name_small: bool)
     hidden = {name for name in estimates if texts.finite_estimate(estimates, name).value is None}
     min_share = 0.01    # of a variance: smaller sources have no line
     return tables.budget_lines(method.details.get('budget'), scale.value, min_share, hidden,
-                               width, name_small, result.has_local_positions(calibration.legs))
+                               width, name_small, result.has_local_fixes(calibration.legs))

@@ -15,13 +15,7 @@ import numpy as np
 from odocal_ros.calib.choice import choose, leg_estimates, relevant_reasons
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.marginal_information import CarriedInformation
-from odocal_ros.calib.result import (
-    Calibration,
-    Estimate,
-    has_local_positions,
-    LegResult,
-    MethodResult,
-)
+from odocal_ros.calib.result import Calibration, Estimate, has_local_fixes, LegResult, MethodResult
 from odocal_ros.calib.value_limits import check_limits
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix, wrap
@@ -64,7 +58,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: CarriedInformati
     methods = {name: _combine_method(name, [
         _LegMethod(leg.methods[name], leg.drive_start_ns, number)
         for number, leg in enumerate(legs, 1) if leg in used and name in leg.methods],
-        config, earlier, has_local_positions(used)) for name in method_names}
+        config, earlier, has_local_fixes(used)) for name in method_names}
     with_marginal = {name for leg in used for name, method in leg.methods.items()
                      if method.marginal}
     estimates, estimating_methods = choose(methods, config.method)
