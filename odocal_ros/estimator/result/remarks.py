@@ -49,12 +49,10 @@ MIN_REPORTED_CHANGE = 3e-4      # relative, rad; judgement, of scale and angles
 # judgement: share and number of outliers among the fixes above which they are reported
 OUTLIER_SHARE, MIN_REPORTED_OUTLIERS = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
-POSE_COVARIANCE_REMEDY = (
-    'Uncertainties were increased to match the residuals. Check the map, and the '
-    'covariance that this source of positions states.')
-POSE_OUTLIER_REMEDY = (
-    'Check the map and the source of positions for jumps. The comparison of track and fixes '
-    'includes these positions.')
+POSE_COVARIANCE_REMEDY = ('Uncertainties were increased to match the residuals. Check the map and '
+                          'the covariance that this source of positions states.')
+POSE_OUTLIER_REMEDY = ('Check the map and the source of positions for jumps. The comparison of '
+                       'track and fixes includes these positions.')
 LEVER_ARM_AXES = 'Axes: from base_link, x forward, y left, z up.'
 CAUSES_OF_ARM_SHIFT = {     # other causes of a deviating lever arm, by its axes
     'xy': 'Slip in turns (skid steering, tracks) also shifts x and y; if that is the cause, keep '
@@ -164,22 +162,19 @@ def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
     straight = -100 * (c[layout.TYRES] * motion.tyre_means)[-1]
+    turns = f'from straight travel ({straight:+z.3f} % from the mean) to the tightest turn'
     texts, remedies = list[str](), list[str]()
-    for i, interval, remedy_if_less in (
+    for i, interval, remedy in (
             (layout.SCALE_BY_SPEED, 'from low to high speed', SPEED_SCALE_REMEDY),
             (layout.SCALE_BY_TIME, 'from start to end', ''),
-            (layout.SCALE_BY_CURVATURE,
-             f'from straight travel ({straight:+z.3f} % from the mean) to the tightest turn',
-             STEERED_REMEDY)):
+            (layout.SCALE_BY_CURVATURE, turns, STEERED_REMEDY)):
         signal = motion.tyre_signals[:, i - layout.TYRES.start]
         change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(signal)
         if abs(change) > max(REMARK_SIGMAS * change_sigma, MIN_REPORTED_CHANGE):
             texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {interval}')
-            remedies.append(remedy_if_less if change < 0 else '')
-    if not texts:
-        return []
+            remedies += [remedy] if remedy and change < 0 else []
     return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(texts)}; the stated '
-                   'value is the mean over this leg', ' '.join(filter(None, remedies)))]
+                   'value is the mean over this leg', ' '.join(remedies))] if texts else []
 
 
 def _bias_step_reasons(fit: Fit) -> list[Reason]:
@@ -252,8 +247,7 @@ def _lever_arm_reasons(c: Floats, sigma: Floats, sigma_ratio: Floats,
         actions += [LEVER_ARM_AXES, 'A wrong imu.lever_arm has the same effect: check it too.'
                     if any(config.imu.lever_arm) else
                     'An imu.lever_arm that is not set has the same effect: set it first.',
-                    *(cause for axes, cause in CAUSES_OF_ARM_SHIFT.items()
-                      if to_measure & set(axes))]
+                    *(x for axes, x in CAUSES_OF_ARM_SHIFT.items() if to_measure & set(axes))]
     return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(texts)}. The other values assume '
                    'the estimated position', ' '.join(actions))] if texts else []
 
