@@ -1,12 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The forecast of a leg while it is recorded, and its text.
-
-A forecast has the sigmas of the leg if it ended at the current position, and the remaining
-distance to the limits. ``leg_forecast.py`` computes it.
-"""
+"""Forecast of a leg: its sigmas if it ended here, remaining distances to the limits, as text."""
 
 from dataclasses import dataclass, field, replace
 import math
