@@ -197,8 +197,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'more than at others.',
         Code.SCALE_VARIES: 'The tyre radius grows with speed and temperature, and a wheel that '
         'steers travels farther in turns: the scale is not constant in this leg. The stated value '
-        'is its mean over the path; `scale_by_speed`, `scale_by_time` and `scale_by_curvature` '
-        'are its slopes.',
+        'is its mean over the path, for straight travel; `scale_by_speed`, `scale_by_time` and '
+        '`scale_by_curvature` are its slopes.',
         Code.CHANGE_IN_LEG: 'Scale, yaw or pitch before and after this time differ by more than 5 '
         'sigma and 0.03 % or 0.017 deg: the IMU or its bracket moved, or tyres, load or '
         'odometer changed. The sigma of an angle was increased so that it covers both values; the '

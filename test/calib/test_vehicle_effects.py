@@ -68,8 +68,9 @@ def test_wheels_that_steer_travel_farther_in_turns(share, seed):
     within = (travel.t >= leg.t_begin) & (travel.t <= leg.t_stop)
     rolled, more = (np.ptp(np.abs(x[within])) for x in (travel.s, additional))
     assert more / rolled > 1e-4
-    true, estimate = scale / (1 + more / rolled), found.estimates['scale_factor']
-    assert abs(estimate.value - true) < 3.0 * estimate.sigma < 1e-4 * true
+    estimate = found.estimates['scale_factor']
+    assert off(found, drive) < 3.0
+    assert estimate.sigma < 0.3 * more / rolled * scale
     slope = found.details['beside']['scale_by_curvature']
     assert abs(slope['slope'] + share * AHEAD**2) < 3.0 * slope['sigma'] < 0.3 * share * AHEAD**2
     assert 'to the tightest turn' in reason_texts(found)[Code.SCALE_VARIES]

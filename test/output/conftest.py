@@ -58,8 +58,7 @@ SMOOTHED = {
     'widened': 1.0, 'noise': {
         'along': 0.003, 'along_hard': 0.004, 'side': 0.002, 'side_turn': 0.005, 'up': 0.002},
     'odometer': {'reading': 0.25, 'period': 0.1, 'speed_step': 0.0, 'hard': 0.25, 'speed': 8.0,
-                 'fastest': 14.0, 'turn_rate': 0.06, 'fastest_turn': 0.3, 'square_speed': 80.0,
-                 'half_squared_curvature': 0.0},
+                 'fastest': 14.0, 'turn_rate': 0.06, 'fastest_turn': 0.3, 'square_speed': 80.0},
     'wheels': {side: {'ratio': 1.0, 'ratio_sigma': 1e-6, 'y': 0.8, 'y_sigma': 3e-4,
                       'walk': (1e-3, 2e-3, 3e-3)} for side in ('left', 'right')},
     **{name: {'value': 0.0, 'sigma': 0.0} for name in (

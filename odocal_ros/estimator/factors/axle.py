@@ -15,7 +15,13 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, iterate_releasing
 from odocal_ros.estimator.preintegrate import Intervals
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
+from odocal_ros.estimator.state import (
+    FAST_SPEED,
+    ODO_ARM,
+    SCALE_BY_CURVATURE,
+    State,
+    TYRES,
+)
 from odocal_ros.nav.rotations import rotate
 from odocal_ros.settings.nominal import G
 
@@ -141,13 +147,17 @@ class Axle:
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + by_slope
 
     def tyre_signals(self, sums: Intervals) -> tuple[Floats, Floats]:
-        """Return the signals of TYRES in each interval, (K, 5), and their means by path, (5,)."""
+        """Return the signals of TYRES in each interval, (K, 5), and those of K, (5,)."""
         state = self.state
         path = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
         signals = tyre_signals_at(path / sums.T, t - state.t[0], self.traction_acceleration(),
                                   sums.mean_rate @ state.C_bv[:, 2])
-        return signals, path / max(path.sum(), 1e-9) @ signals
+        # K is that of the mean speed, time and force, but of straight travel: few drives have the
+        # same turns
+        reference = path / max(path.sum(), 1e-9) @ signals
+        reference[SCALE_BY_CURVATURE - TYRES.start] = 0.0
+        return signals, reference
 
 
 def tyre_signals_at(speed: Floats, t: Floats, acceleration_along: Floats,

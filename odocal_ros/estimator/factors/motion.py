@@ -155,8 +155,8 @@ class Motion:
         state, c = self.state, self.state.constants
         self.pitch_lean, self.yaw_lean = self.axle.lean_accelerations(self.sums.mean_rate)
         self.t_middle = (state.t[1:] + state.t[:-1]) / 2
-        tyre_signals, self.tyre_means = self.axle.tyre_signals(self.sums)
-        self.tyre_signals = tyre_signals - self.tyre_means
+        tyre_signals, reference = self.axle.tyre_signals(self.sums)
+        self.tyre_signals = tyre_signals - reference
         self.half_pitch_variance = np.maximum(
             self.left @ self.angle_covariances @ self.left, 0.0) / 2
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES, None] \

@@ -167,10 +167,10 @@ class SpeedSteps(PointRows):
             + np.cross(points.rate_change, arm_b) @ state.forward
         c = state.constants
         axle = Axle(problem, state)
-        _, means = axle.tyre_signals(point.intervals)
+        _, reference = axle.tyre_signals(point.intervals)
         self.tyre_signals = tyre_signals_at(
             self.speed, state.t[self.k] - state.t[0] + points.tau,
-            axle.traction_acceleration()[self.k], points.rate @ state.C_bv[:, 2]) - means
+            axle.traction_acceleration()[self.k], points.rate @ state.C_bv[:, 2]) - reference
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES]
         speed_by_wheel = self.instants.value + self.instants.sign * c[layout.SPEED_OFFSET]
         speed_by_wheel *= state.scale * self.scale_ratio

@@ -39,8 +39,7 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, marginals: Jo
     Return ``odometer`` and ``accelerometer_bias``, as details of a method.
 
     odometer: sigma of a reading in scale units, period s, step of a quantised speed in scale units
-    per s, share of the motion with acceleration, speeds m/s and turn rates rad/s in motion,
-    mean of half the squared curvature over the path, 1/m^2.
+    per s, share of the motion with acceleration, speeds m/s and turn rates rad/s in motion.
     Biases at the start of the leg in b, m/s^2. factor : on the sigmas of the fit.
     """
     motion = fit.weighted[MotionRows].motion
@@ -59,9 +58,7 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, marginals: Jo
         'hard': float(accelerating_and_turning(motion)[0][moving].mean()),
         'speed': float(np.sqrt(np.mean(speed**2))), 'fastest': float(speed.max()),
         'turn_rate': float(np.sqrt(np.mean(rate**2))), 'fastest_turn': float(rate.max()),
-        'square_speed': float(speed @ speed**2 / speed.sum()) if speed.any() else 0.0,
-        'half_squared_curvature': float(motion.tyre_means[layout.SCALE_BY_CURVATURE
-                                                          - layout.TYRES.start])}
+        'square_speed': float(speed @ speed**2 / speed.sum()) if speed.any() else 0.0}
     sigma = np.sqrt(np.diagonal(marginals[0])[BA]) * factor
     ratio = sigma / fit.initial_priors.accel_bias_sigma
     biases = zip('xyz', fit.state.accel_bias[0], sigma, ratio, strict=True)
@@ -207,8 +204,7 @@ class TwistNoise:
         by_speed, by_curvature = (_mean_square(leg[f'scale_by_{signal}'])
                                   for signal in ('speed', 'curvature'))
         square = (v**2 - leg['odometer']['square_speed']) / (2 * FAST_SPEED)
-        curvature = w**2 / (2 * max(v**2, WALK_SPEED**2)) - leg['odometer'][
-            'half_squared_curvature']
+        curvature = w**2 / (2 * max(v**2, WALK_SPEED**2))
         return float(v**2 * ((sigma / scale)**2 + by_speed * square**2
                              + by_curvature * curvature**2))
 

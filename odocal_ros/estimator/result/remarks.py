@@ -40,8 +40,8 @@ SPEED_SCALE_REMEDY = ('Possible causes: truncated speed values, a dead band, or 
                       'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
                       'Use wheel pulses, or a wheel that is not driven.')
 STEERED_REMEDY = ('Likely cause: the odometer counts wheels that steer, alone or in a mean; in '
-                  'turns they travel farther. Use wheels that do not steer, or calibrate on a '
-                  'drive with as many turns as the later ones.')
+                  'turns they travel farther. Use wheels that do not steer, or correct turns '
+                  'with scale_by_curvature (calibration.json).')
 # judgement: variance factor of a bias walk that is a step: 480 and more, without at most 7.3
 # (docs/decisions/0016)
 STEP_VARIANCE = 100.0
@@ -161,20 +161,20 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
 def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
-    straight = -100 * (c[layout.TYRES] * motion.tyre_means)[-1]
-    turns = f'from straight travel ({straight:+z.3f} % from the mean) to the tightest turn'
     texts, remedies = list[str](), list[str]()
     for i, interval, remedy in (
             (layout.SCALE_BY_SPEED, 'from low to high speed', SPEED_SCALE_REMEDY),
             (layout.SCALE_BY_TIME, 'from start to end', ''),
-            (layout.SCALE_BY_CURVATURE, turns, STEERED_REMEDY)):
+            (layout.SCALE_BY_CURVATURE, 'from straight travel to the tightest turn',
+             STEERED_REMEDY)):
         signal = motion.tyre_signals[:, i - layout.TYRES.start]
         change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(signal)
         if abs(change) > max(REMARK_SIGMAS * change_sigma, MIN_REPORTED_CHANGE):
             texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {interval}')
             remedies += [remedy] if remedy and change < 0 else []
     return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(texts)}; the stated '
-                   'value is the mean over this leg', ' '.join(remedies))] if texts else []
+                   'value is the mean over this leg, for straight travel', ' '.join(remedies))
+            ] if texts else []
 
 
 def _bias_step_reasons(fit: Fit) -> list[Reason]:
