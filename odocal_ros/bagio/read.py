@@ -122,7 +122,7 @@ class Bag:
         readers : topic -> reader of its messages.   feed : called with (slot, block) of samples,
         in order of bag time.   progress : called with the fraction done.
 
-        Raises BadUsage, BadBag, BadData: a topic is not in the bag; none of the messages can be
+        Raises BadTopics, BadBag, BadData: a topic is not in the bag; none of the messages can be
         read; none of a topic's can be used.
         """
         for topic in readers.keys() - self.topics.keys():

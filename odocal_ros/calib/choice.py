@@ -45,16 +45,16 @@ COMPARED = {
                              'accelerometer bias')}
 
 
-def deciding_methods(method_setting: str | tuple[str, ...],
-                     compared: bool = False) -> tuple[str, ...]:
-    """Return the methods that may give the result, best first; compared: also ALWAYS_COMPUTED."""
+def deciding_methods(method_setting: str | tuple[str, ...]) -> tuple[str, ...]:
+    """Return the methods that may give the result, best first."""
     if not isinstance(method_setting, str):
         return method_setting
-    if method_setting in ('auto', 'all'):
-        return METHOD_ORDER
-    method_setting = VALUES_FROM.get(method_setting, method_setting)
-    return tuple(dict.fromkeys((method_setting, ALWAYS_COMPUTED))) if compared else (
-        method_setting,)
+    return METHOD_ORDER if method_setting in ('auto', 'all') else (
+        VALUES_FROM.get(method_setting, method_setting),)
+
+
+def computed_methods(method_setting: str) -> set[str]:
+    return {*deciding_methods(method_setting), ALWAYS_COMPUTED}
 
 
 def choose(methods: Mapping[str, MethodResult],

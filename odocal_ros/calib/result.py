@@ -20,7 +20,7 @@ from odocal_ros.reasons import Code, Reason, SEVERITY, Verdict, verdict_of
 NOT_ESTIMATES = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time', 'scale_by_curvature',
                            'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
                            'pitch_mounting_angle_housing_sigma'})
-AS_SENT = 'scale_factor_as_sent'     # of speeds as published, without the correction of steps
+RAW_SCALE = 'scale_factor_as_sent'     # of a quantised speed as published
 WHEEL_PREFIX = 'scale_factor_'     # format: before the name of a wheel
 TRACE = 'trace'      # format: key in the details of a method that raised an exception: traceback
 
@@ -54,7 +54,7 @@ def unknown_values(scale_unit: str) -> dict[str, Estimate]:
 
 def wheel_factors(estimates: Iterable[str]) -> list[str]:
     """Return the names of the scale factors of single wheels."""
-    return [name for name in estimates if name.startswith(WHEEL_PREFIX) and name != AS_SENT]
+    return [name for name in estimates if name.startswith(WHEEL_PREFIX) and name != RAW_SCALE]
 
 
 @dataclass(frozen=True, eq=False)

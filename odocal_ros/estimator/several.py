@@ -26,7 +26,7 @@ from odocal_ros.estimator.result.estimates import (
     not_observable_reason,
     OPTIONAL,
 )
-from odocal_ros.estimator.result.odometry_output import additional_figures, combine_as_sent
+from odocal_ros.estimator.result.odometry_output import additional_figures, combine_raw_scales
 from odocal_ros.estimator.result.outcome import IMPERFECTION_CONSTANTS, with_model_floor
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.state import CONSTANTS, IMPERFECTIONS, LN_K, PITCH
@@ -102,7 +102,7 @@ def _estimate(legs: Sequence[MethodResult], fitted: FittedConstants,
     nominal = next((K / ratio for K, ratio in scales if K and ratio), 0.0)
     estimates, refusals = estimate_constants(fitted, legs[-1].estimates['scale_factor'].unit,
                                              nominal, config)
-    estimates |= combine_as_sent(legs, estimates['scale_factor'])
+    estimates |= combine_raw_scales(legs, estimates['scale_factor'])
     if wheels:
         wheel_estimates, reasons = wheel_result.wheel_estimates(
             list(wheels), wheels, estimates['scale_factor'], config)

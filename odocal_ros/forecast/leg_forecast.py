@@ -84,7 +84,7 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
 def _forecast_by_end_points(leg: Leg, fix_rate: float, config: Config,
                             is_needed: Callable[[], bool]) -> Forecast:
     """Return the two_point forecast of the leg with its end points."""
-    inputs = leg_so_far.screened_in_cells(leg, config).inputs
+    inputs = leg_so_far.screen_thinned(leg, config).inputs
     profile = leg_so_far.drive_profile(inputs, config)
     sigmas = Sigmas(config=_with_expected_heading(leg, config),
                     **leg_so_far.fix_and_count_accuracy(inputs, config) | {'fix_rate': fix_rate})

@@ -73,14 +73,14 @@ class ImuGaps:
 
 
 @lru_cache(maxsize=1)      # faults and running estimate of one update use the same leg
-def screened_in_cells(leg: Leg, config: Config) -> ScreenedLeg:
-    """Return the inputs of a leg whose IMU rows are means over cells of time."""
+def screen_thinned(leg: Leg, config: Config) -> ScreenedLeg:
+    """Return the inputs of a thinned leg; its IMU rows are means over cells of time."""
     return screen_leg(leg, _with_cells(leg, config))
 
 
-def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:
-    """Return the faults of a leg whose IMU rows are means over cells of time."""
-    return find_faults(screened_in_cells(leg, config), _with_cells(leg, config))
+def find_thinned_faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
+    """Return the faults of a thinned leg."""
+    return find_faults(screen_thinned(leg, config), _with_cells(leg, config))
 
 
 def _with_cells(leg: Leg, config: Config) -> Config:
@@ -201,7 +201,7 @@ class SmootherSoFar:
 
     def _smoother_leg(self, leg: Leg, config: Config) -> SmootherLeg:
         """Return the inputs of the smoother; raise BadData if they are not sufficient yet."""
-        screened = screened_in_cells(leg, config)
+        screened = screen_thinned(leg, config)
         inputs = screened.inputs
         if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2:
             raise BadData('the smoother needs IMU and odometer samples')

@@ -53,7 +53,7 @@ class Robot:
 
 
 def _wheels(increments: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
-    """Return the wheels of body increments, (n, 3), and the constants after the inverse width."""
+    """Return the wheels of body increments, (n, 3), and the constants that only this drive has."""
     if robot.drive in settings.HOLONOMIC:
         rows = wheel_rows(robot.drive, robot.wheels)
         count = (increments * [1.0, 1.0, robot.width / 2]) @ rows.T
@@ -141,7 +141,7 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config)
     leg = ideal.leg
     half_difference = np.interp(leg.t_imu, drive.t, drive.yaw - drive.yaw[0]) * robot.width / 2
     used = np.arange(len(leg.t_fix))
-    if robot.at_rests:      # the fixes nearest to the middle of each rest
+    if robot.at_rests:      # fixes nearest to the middle of each rest; t is 0 at the first move
         t_middle = motion.rests.mean(axis=1) - motion.t[np.argmax(motion.moving) - 1]
         used = np.abs(leg.t_fix[:, None] - t_middle).argmin(axis=0)
     leg = replace(

@@ -5,7 +5,7 @@
 The Earth: WGS 84 ellipsoid, gravity and rates; geodetic, Earth-fixed and local coordinates.
 
 A local metric frame is a tangent plane of the ellipsoid (x east, y north, z up) at
-FRAME_LONGITUDE, for methods that use the ellipsoid. Only its latitude has a meaning.
+FRAME_LONGITUDE, for methods that use the ellipsoid. The longitude is arbitrary.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ USUAL_LATITUDE_DEG = 45.0
 # m from the origin along an axis: there the vertical differs by 0.18 deg from the z axis.
 # Judgement: larger values are map coordinates (UTM), which are not in a tangent plane
 LARGEST_FRAME = 20_000.0
-# m, least significant motion of positions, from GNSS and in a local frame. Judgement: a receiver
+# m, smallest motion that positions of GNSS and of a local frame show. Judgement: a receiver
 # at rest drifts by many metres, SLAM and motion capture by centimetres
 MIN_GNSS_MOTION, MIN_LOCAL_MOTION = 20.0, 0.5
 

@@ -50,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'floor: straight, square, figure_eight or spot (default: all)')
     add('--reference', metavar='NAME', help='with --indoor: mocap, total_station, slam, amcl or '
         'marks (default slam)')
-    add('--drive', metavar='NAME', help='with --indoor: drive of the robot, as in '
-        'odometer.drive (default differential)')
+    add('--drive', metavar='NAME', help='with --indoor: differential (default), skid, mecanum '
+        'or omni')
     add('--no-imu', action='store_true', help='with --indoor: a robot without an IMU')
     add('--size', type=float, metavar='M', help='with --indoor: length of a straight (default 4)')
     add('--rounds', type=int, metavar='N', help='with --indoor: number of repetitions (default 1)')

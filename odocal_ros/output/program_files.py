@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from odocal_ros.calib.result import Calibration, LegResult, NOT_ESTIMATES
+from odocal_ros.calib.result import Calibration, LegResult, NOT_ESTIMATES, RAW_SCALE
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.output import device_files
@@ -40,7 +40,7 @@ IMU = 'imu_corrector.param.yaml'
 LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_transform.txt')
 NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, TRACK, LEGS, device_files.CONTROLLERS,
          device_files.DEVICES, device_files.TWIST, device_files.IMU_ERRORS}
-# parameters that the node declares for one wheel too; they are then unknown
+# the file always contains these parameters; without two wheels they have no value
 TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'track_width')
 AXES = 'xyz'
 IMU_FRAME = 'imu_link'      # REP-145, by default
@@ -102,7 +102,7 @@ def _speed_factor(calibration: Calibration) -> float | None:
     """Return the factor for raw speeds; for pulses only with a nominal scale."""
     scale, ratio = (calibration.estimates.get(name) for name in ('scale_factor', 'scale_ratio'))
     if scale is not None and scale.unit == '1':
-        return calibration.estimates.get('scale_factor_as_sent', scale).value
+        return calibration.estimates.get(RAW_SCALE, scale).value
     return None if ratio is None else ratio.value
 
 

@@ -20,10 +20,10 @@ from odocal_ros.settings.config import Config, flat, SETTINGS
 UNDETERMINED = 'not determined'
 # reasons about the data of a leg
 DATA_CODES = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
-           Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
-           Code.COVARIANCE_UNKNOWN, Code.WHEEL_SLIP, Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX,
-           Code.WHEEL_COUNTERS_DIFFER, Code.ODOMETER_CHOSEN, Code.DELAY_SEEN,
-           Code.REVERSING_UNSIGNED}
+              Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
+              Code.COVARIANCE_UNKNOWN, Code.WHEEL_SLIP, Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX,
+              Code.WHEEL_COUNTERS_DIFFER, Code.ODOMETER_CHOSEN, Code.DELAY_SEEN,
+              Code.REVERSING_UNSIGNED}
 
 
 def label(name: str, local: bool = False) -> str:
@@ -119,7 +119,7 @@ def method_table(methods: dict[str, result.MethodResult],
 
 def budget_table(method: result.MethodResult, local: bool) -> dict[str, Any] | None:
     """
-    Return a method's error budget: heads, rows of (source, shared, cells), small sources.
+    Return a method's error budget: heads, rows (source, shared by all legs, cells), small sources.
 
     A cell is (sigma as text, share of the variance) or None below half a per cent.
     local : positions in a local frame.

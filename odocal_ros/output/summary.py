@@ -111,17 +111,17 @@ def _value_lines(calibration: result.Calibration, width: int) -> list[str]:
 
 def _scale_lines(calibration: result.Calibration) -> list[str]:
     """Return the lines of the scale factor, its ratios and its inverse."""
-    scale, ratio, as_sent = (texts.finite_estimate(calibration.estimates, name) for name in (
-        'scale_factor', 'scale_ratio', result.AS_SENT))
+    scale, ratio, raw = (texts.finite_estimate(calibration.estimates, name) for name in (
+        'scale_factor', 'scale_ratio', result.RAW_SCALE))
     lines = [_line('scale factor', _scale_text(scale))]
     if scale.value and scale.unit in texts.COUNTS:
         lines.append(_line('', texts.inverse_text(scale)))
     if ratio.value is not None:
         lines.append(_line('  ratio to nominal', f'{texts.with_sigma(ratio.value, ratio.sigma)}   '
                            f'({texts.deviation_text(ratio.value, ratio.sigma)})'))
-    if as_sent.value is not None:
-        lines.append(_line('  of the raw speed', _scale_text(as_sent)))
-    return [*lines, _path_ratio_line(calibration, scale, as_sent)]
+    if raw.value is not None:
+        lines.append(_line('  of the raw speed', _scale_text(raw)))
+    return [*lines, _path_ratio_line(calibration, scale, raw)]
 
 
 def _other_lines(estimates: dict[str, result.Estimate], wheels: dict[str, str]) -> list[str]:
@@ -130,7 +130,7 @@ def _other_lines(estimates: dict[str, result.Estimate], wheels: dict[str, str]) 
     for name in estimates:
         estimate = texts.finite_estimate(estimates, name)
         quantity = name.rpartition('_')[0]      # without the axis
-        if name not in ('scale_factor', 'scale_ratio', result.AS_SENT, *texts.ANGLES, *BIASES,
+        if name not in ('scale_factor', 'scale_ratio', result.RAW_SCALE, *texts.ANGLES, *BIASES,
                         *wheels) and quantity not in ARMS and estimate.value is not None:
             lines.append(_line(tables.source_label(name), texts.with_unit(estimate)))
     return lines
@@ -180,12 +180,12 @@ def _wheel_lines(estimates: dict[str, result.Estimate]) -> dict[str, str]:
 
 
 def _path_ratio_line(calibration: result.Calibration, scale: result.Estimate,
-                     as_sent: result.Estimate) -> str:
+                     raw: result.Estimate) -> str:
     """Return the line that compares the path ratio of the legs with the scale factor."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     path = sum(distance for _, distance in ratios)
     factor, label = (
-        (scale, 'scale factor') if as_sent.value is None else (as_sent, 'factor of the raw speed'))
+        (scale, 'scale factor') if raw.value is None else (raw, 'factor of the raw speed'))
     if not factor.value or not path:
         return ''
     ratio = sum(leg_ratio * distance for leg_ratio, distance in ratios) / path

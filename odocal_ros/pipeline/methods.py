@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.calib import choice
 from odocal_ros.calib.drive import path_and_chord
-from odocal_ros.calib.result import AS_SENT, failure, LegResult, MethodResult, raise_on_overflow
+from odocal_ros.calib.result import failure, LegResult, MethodResult, raise_on_overflow, RAW_SCALE
 from odocal_ros.calib.two_point import refused_result
 from odocal_ros.data.arrays import release_mapped_memory
 from odocal_ros.data.leg import Leg
@@ -96,7 +96,7 @@ def _add_model_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
         result = add(result, prepared)
     if result.name == 'two_point':
         result = replace(result, reasons=(
-            *prepared.alignment_reasons, *prepared.end_reasons, *result.reasons))
+            *prepared.alignment_reasons, *prepared.end_point_reasons, *result.reasons))
     return run._replace(result=result)
 
 
@@ -137,8 +137,7 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     leg, inputs, selected_method = prepared.leg, prepared.inputs, prepared.config.method
-    computed = choice.deciding_methods(selected_method, compared=True)
-    names = [name for name in METHODS if name in computed]
+    names = [name for name in METHODS if name in choice.computed_methods(selected_method)]
     runs = run_methods(names, prepared, _progress_reporter(names, progress))
     progress(Stage('tracks', 1.0 - TRACKS_EFFORT / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
@@ -151,10 +150,10 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     track_fields: dict[str, Any] = {}
     if scale is not None and paths is not None:
         distance_sigma = 0.05    # largest relative sigma of a scale for the distance
-        # more accurate than the approximate scale; the travel is that of the uncorrected speed
+        # more accurate than the approximate scale; the travel is the integral of the raw speed
         if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
             prepared = checked_with_scale(
-                prepared, estimates.get(AS_SENT, scale).value or scale.value)
+                prepared, estimates.get(RAW_SCALE, scale).value or scale.value)
         track_fields, track_reasons = track_results(prepared, paths)
         reasons += track_reasons
         for name, run in runs.items():

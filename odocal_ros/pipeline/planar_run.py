@@ -25,7 +25,7 @@ from odocal_ros.screening.screen import screen
 from odocal_ros.settings import config as settings
 from odocal_ros.settings.nominal import grade_of, nominal_scale
 
-# judgement: s between nodes, 0.1 rad of a turn; number of nodes
+# judgement: s between nodes, at 1 rad/s a turn of 0.1 rad; largest number of nodes
 NODE_INTERVAL, MAX_NODES = 0.1, 20_000
 MIN_POSITIONS = 10       # judgement: as for other methods
 # least distance for a slope, m and in sigmas of a height, judgement: longer than a room is high

@@ -85,7 +85,7 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFix
     distance, drive_reasons = drive.check_drive(track, inputs.t_stop, located.rough_scale,
                                                 config.leg)
     # only methods by end points need straight legs
-    end_reasons = tuple(r for r in drive_reasons if r.code is Code.LEG_NOT_STRAIGHT)
+    end_point_reasons = tuple(r for r in drive_reasons if r.code is Code.LEG_NOT_STRAIGHT)
     return PreparedLeg(
         **vars(located), leg=leg, inputs=inputs, config=config, imu_orientation=orientation,
         lever_v=np.subtract(config.gnss.lever_arm, config.odometer.lever_arm),
@@ -95,7 +95,8 @@ def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, located: LocatedFix
         t_fit=_time_of_four_fifths(track, inputs.t_stop) if holdout else inputs.t_stop,
         holdout=holdout,
         reasons=(*reasons, *gap_reasons, *coarse_reasons(inputs, located), *wheel_reasons,
-                 *(r for r in drive_reasons if r not in end_reasons)), end_reasons=end_reasons)
+                 *(r for r in drive_reasons if r not in end_point_reasons)),
+        end_point_reasons=end_point_reasons)
 
 
 def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:

@@ -96,7 +96,7 @@ class PreparedLeg(LocatedFixes):
     t_fit: float                         # s, end of the data that a fit uses
     holdout: bool                        # True: fixes after ``t_fit`` check the result
     reasons: tuple[Reason, ...]          # on the leg, for all methods
-    end_reasons: tuple[Reason, ...]      # only for methods that use its end points alone
+    end_point_reasons: tuple[Reason, ...]      # for methods that only use its end points
 
     def path(self, f: Floats, track: dead_reckoning.Track | None = None) -> Path:
         """Return the path of the antenna for f, (3,) scale times forward axis in b."""

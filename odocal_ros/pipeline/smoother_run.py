@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.marks import Path
-from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.result import Estimate, MethodResult, RAW_SCALE
 from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.wheel_search.parameter_sets import search_ranges
 from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
@@ -49,9 +49,9 @@ def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     track = dead_reckon(t, q_nb, replace(travel, t=travel.t - delays_s['odometer']))
     lever_b = method.details['C_bv'] @ _lever_v(method.estimates, prepared.config)
     f = method.details['f']
-    as_sent = method.estimates.get('scale_factor_as_sent')
-    if as_sent is not None:        # the travel here is that of uncorrected speeds
-        f = f * (as_sent.value or 0.0) / np.linalg.norm(f)
+    raw = method.estimates.get(RAW_SCALE)
+    if raw is not None:        # the travel here is the integral of the raw speed
+        f = f * (raw.value or 0.0) / np.linalg.norm(f)
     before = prepared.path(prepared.configured_forward(f, method.estimates),
                            dead_reckon(t, q_nb, travel))
     # of coarse speeds the fit only uses the steps: slip is detected by this track

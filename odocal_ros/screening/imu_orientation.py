@@ -136,14 +136,14 @@ def orientation_of(binned: Accelerations) -> ImuOrientation | None:
                           float((gain[1] / gain[0]).real), float(centripetal_sigma))
 
 
-def corrected_forward_axis(orientation: ImuOrientation | None, f: Floats) -> Floats:
-    """Return f, scale times forward axis, (3,), rotated to the IMU orientation if far from it."""
-    yaw, pitch = mounting_from_forward(f)
-    min_difference = np.deg2rad(10.0)    # a smaller one has no effect on slips
+def corrected_forward_axis(orientation: ImuOrientation | None, forward: Floats) -> Floats:
+    """Return scale times forward axis, (3,), rotated to the IMU orientation if far from it."""
+    yaw, pitch = mounting_from_forward(forward)
+    min_difference = np.deg2rad(10.0)    # a smaller one has no effect on the search for slips
     if orientation is None or abs(float(wrap(orientation.yaw - yaw))) < max(
             min_difference, 3 * orientation.sigma):
-        return f
-    return np.linalg.norm(f) * forward_b(orientation.yaw, pitch)
+        return forward
+    return np.linalg.norm(forward) * forward_b(orientation.yaw, pitch)
 
 
 def orientation_reasons(orientation: ImuOrientation | None,

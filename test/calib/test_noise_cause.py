@@ -9,7 +9,7 @@ from drives import drive, settings
 import numpy as np
 import pytest
 
-from odocal_ros.calib.result import AS_SENT
+from odocal_ros.calib.result import RAW_SCALE
 from odocal_ros.estimator.result.mismatch import find_noise_cause, find_quantisation_steps
 from odocal_ros.estimator.result.odometry_output import twist_noise
 from odocal_ros.estimator.several import _disagreement_reasons
@@ -114,7 +114,7 @@ def errors_over_sigma(made):
     t = (made.odometer.stamp_ns - made.options.start_ns) * 1e-9
     state, T = made.motion.at(t), np.diff(t)
     if made.options.odometer == 'speed':        # instantaneous
-        factor = estimates.get(AS_SENT, estimates['scale_factor']).value
+        factor = estimates.get(RAW_SCALE, estimates['scale_factor']).value
         v, w, wheels = state.speed[1:], state.yaw_rate[1:], [factor * made.odometer.value[1:]]
     else:                                       # mean between two messages
         sides = ('_left', '_right') if len(made.wheels) > 1 else ('',)

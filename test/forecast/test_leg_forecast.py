@@ -16,7 +16,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import leg_forecast
 from odocal_ros.forecast.forecast import Forecast, ParameterForecast, status_keys, UNREACHABLE_TEXT
 from odocal_ros.forecast.leg_forecast import drive_on, forecast_leg, LegEnded
-from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
+from odocal_ros.forecast.leg_so_far import find_thinned_faults, SmootherSoFar
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.live.answers import hint
 from odocal_ros.live.session import Session, SessionView
@@ -204,7 +204,7 @@ def test_without_an_accelerometer_the_forecast_has_a_scale_and_no_angle(two, met
 def test_swapped_wheels_are_reported_during_the_recording(two):
     leg = two.leg()
     swapped = replace(leg, odometer=leg.odometer_right, odometer_right=leg.odometer)
-    found = faults_in_cells(swapped, with_settings(Config(), {
+    found = find_thinned_faults(swapped, with_settings(Config(), {
         'odometer.track_width': 1.6, 'imu.grade': 'tactical'}))
     assert found[0].code is Code.WHEELS_SWAPPED
     assert 'Swap odometer.left' in found[0].remedy

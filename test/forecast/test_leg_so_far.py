@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
+from odocal_ros.forecast.leg_so_far import find_thinned_faults, ImuGaps
 from odocal_ros.forecast.progress import OdometerProgress, Progress
 from odocal_ros.forecast.quantities import find_observable
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
@@ -52,7 +52,8 @@ def test_faults_during_the_recording_are_those_of_the_result(made, wrong):
     lowering = {r.code for r in result.reasons
                 if r.code.severity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
     assert {r.code for r in find_faults(screen_leg(leg, config), config)} == lowering
-    assert {r.code for r in faults_in_cells(thinned(leg).leg(leg.start_ns), config)} == lowering
+    during = find_thinned_faults(thinned(leg).leg(leg.start_ns), config)
+    assert {r.code for r in during} == lowering
     assert (lowering == set()) == (wrong == 'sound')
 
 

@@ -96,10 +96,9 @@ def refine(criterion: Callable[..., Any], x: Floats, width: Floats, half_range: 
     """
     Return the minimum of a criterion by response surfaces.
 
-    criterion : function of (m, 3) parameters x with (m,) values.   x : (3,) first values: the best
-    row of an array.   width : (3,) half width of the first box in x: a step between levels.
-    half_range : (3,) half of the search range about zero.   space : free parameters.   widen :
-    double the range if the minimum is on its edge.
+    criterion : function of (m, 3) parameters x with (m,) values.   x : (3,) first values.
+    width : (3,) half width of the first box in x.   half_range : (3,) half of the search range
+    about zero.   space : free parameters.   widen : double it if the minimum is on its edge.
     """
     search = _BoxSearch(criterion, space, half_range, width, x)
     first = last = search.surface()
@@ -132,7 +131,7 @@ class _BoxSearch:
         self.first_half_range = self.half_range = half_range
         self.first_half_width = np.abs(
             space.q_of(width) if space.ratio_is_fixed else
-            np.array([width[:2].mean(), width[:2].sum(), width[2]]))
+            np.array([width[:2].mean(), width[:2].sum(), width[2]]))     # widths add up
         self.half_width = self.first_half_width
         self.q = space.q_of(x)
         self.grid = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(self.q))))
@@ -204,7 +203,7 @@ class SquaresMinimum:
     iterations: int
     converged: bool
     covariance: Floats       # (3, 3) of x by the scatter, without errors of start, gyro, lever arm
-    condition: float         # number of the Jacobian by relative scales (or both) and heading, rad
+    condition: float         # number of the Jacobian by the free relative scales and heading, rad
     sigma_difference: float  # of right minus left, relative; with a bend of the track
 
     @property

@@ -4,9 +4,9 @@
 """
 Data of a fitted leg for other programs, beside the calibrated values.
 
-``odometry_details`` describes odometer messages and motion, ``factor_as_sent`` is the scale factor
-of a quantised speed for programs that only multiply, ``TwistNoise`` the covariance of the twist
-(speed and turn rate) that calibrated wheels give.
+``odometry_details`` describes odometer messages and motion, ``raw_scale`` is the scale factor of a
+quantised speed for programs that only multiply, ``TwistNoise`` the covariance of the twist (speed
+and turn rate) that calibrated wheels give.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.result import AS_SENT, Calibration, Estimate, MethodResult
+from odocal_ros.calib.result import Calibration, Estimate, MethodResult, RAW_SCALE
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
@@ -67,9 +67,9 @@ def odometry_details(leg: SmootherLeg, problem: Problem, fit: Fit, marginals: Jo
         for axis, value, s, ratio in biases}} if leg.has_accelerometer else {})
 
 
-def factor_as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Estimate]:
+def raw_scale(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Estimate]:
     """
-    Return the path length over the integral of the published speeds, by name; {} without steps.
+    Return the path length over the integral of the raw speeds, by name; {} without steps.
 
     It differs from K, since a truncated speed lacks half a step while the vehicle moves:
     K (1 + offset t / s), with t the time in motion and s the integral.
@@ -89,18 +89,18 @@ def factor_as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[s
     gradient, rows = np.array([1.0, by_offset / ratio]), [LN_K, SPEED_OFFSET]
     relative = float(np.sqrt(gradient @ covariance[np.ix_(rows, rows)] @ gradient))
     value = state.scale * ratio
-    return {AS_SENT: Estimate(value, value * relative, leg.scale_unit)}
+    return {RAW_SCALE: Estimate(value, value * relative, leg.scale_unit)}
 
 
-def combine_as_sent(legs: Sequence[MethodResult], scale: Estimate) -> dict[str, Estimate]:
-    """Return ``factor_as_sent`` of several legs: joint scale times mean ratio to the scale."""
-    ratios = [(leg.estimates[AS_SENT].value or 0.0) / (leg.estimates['scale_factor'].value or 1.0)
-              for leg in legs if AS_SENT in leg.estimates]
+def combine_raw_scales(legs: Sequence[MethodResult], scale: Estimate) -> dict[str, Estimate]:
+    """Return ``raw_scale`` of several legs: joint scale times mean ratio to the scale."""
+    ratios = [(e[RAW_SCALE].value or 0.0) / (e['scale_factor'].value or 1.0)
+              for e in (leg.estimates for leg in legs) if RAW_SCALE in e]
     if not ratios or scale.value is None or scale.sigma is None:
         return {}
     ratio = float(np.mean(ratios))
     sigma = float(np.hypot(scale.sigma, scale.value * np.std(ratios) / np.sqrt(len(ratios))))
-    return {AS_SENT: Estimate(scale.value * ratio, sigma * ratio, scale.unit)}
+    return {RAW_SCALE: Estimate(scale.value * ratio, sigma * ratio, scale.unit)}
 
 
 def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
@@ -174,7 +174,7 @@ class TwistNoise:
         """Return ``variances`` from one leg; v, w : m/s, rad/s, speed and turn rate, absolute."""
         noise, odometer, T = leg['noise'], leg['odometer'], self.period
         K = self._estimate('scale_factor')[0]
-        factor = self._estimate(AS_SENT)[0] or K
+        factor = self._estimate(RAW_SCALE)[0] or K
         # as in interval_noise.py: noise is proportional to the time, below 1 m/s to the path
         per_level = min(max(v, 0.02), 1.0) / T      # 1/s, variance of a mean speed over its level
         accelerating = odometer['hard']             # share of the time

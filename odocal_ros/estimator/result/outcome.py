@@ -133,7 +133,7 @@ def _estimate(leg: SmootherLeg, fit: Fit, posterior: _Posterior,
                              posterior.sigma_ratio, posterior.factor, changed_angles)
     estimates, reasons = estimate_constants(fitted, leg.scale_unit, leg.nominal_scale, config)
     if estimates['scale_factor'].value is not None:
-        estimates |= odometry_output.factor_as_sent(leg, fit.state, posterior.covariance)
+        estimates |= odometry_output.raw_scale(leg, fit.state, posterior.covariance)
     return estimates, reasons
 
 
