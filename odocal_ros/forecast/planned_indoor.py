@@ -98,9 +98,9 @@ def predict_planar(motion: RobotMotion, robot: Robot, config: settings.Config) -
     run = Run(motion.t, wheels, node, state[node, :2], np.full(len(node), robot.position_sigma),
               turn if robot.imu else np.empty(0))
     known = replace(known_values(run, config), drift_length=robot.drift_length)
-    _, prior = priors(run, known, 1.0, 1.0, robot.width)
-    gains = np.array([1.0, 1.0, 1 / robot.width])
-    fit = fit_at(run, known, state, constants, _levels(motion, robot, run.wheels), gains, prior)
+    _, prior = priors(run, known, left=1.0, right=1.0, width=robot.width)
+    fit = fit_at(run, known, state, constants, _levels(motion, robot, run.wheels),
+                 first_gains=np.array([1.0, 1.0, 1 / robot.width]), prior=prior)
     return make_planar_result(fit, '1', 0.0, config)
 
 
