@@ -132,7 +132,7 @@ def _shared_effects(i: int, results: Sequence[MethodResult]) -> dict[str, Floats
 
 def _weights(covariance: Floats) -> Floats:
     """Return the weights, none below zero, of the mean with the least variance: (T14)."""
-    # by unshared errors alone, a leg that a shared error dominates would make the mean worse
+    # weights by unshared errors alone are too large for a leg that a shared error dominates
     from scipy.optimize import nnls
     root = np.linalg.cholesky(covariance / np.trace(covariance))
     weight, _ = nnls(root.T, np.linalg.solve(root, np.ones(len(root))))

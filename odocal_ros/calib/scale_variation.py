@@ -28,9 +28,9 @@ CORRELATIONS = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
 SIDE_SCATTER = 0.25    # judgement: share of the change by which sections on one side may differ
 MAX_DECODING = 20.0    # judgement: largest factor between units, gears or decodings of a counter
 WINDOWS = 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0     # s, definition
-# judgement: parts of the leg for a sigma; windows for a result
+# judgement: parts of the leg for a sigma, lower limit of the number of windows
 LEG_PARTS, MIN_WINDOWS = 8, 12
-NO_WINDOWS = np.empty((0, 4))    # definition
+NO_WINDOWS = np.empty((0, 4))    # definition: empty result of ``window_scale``
 
 
 class Similarity(NamedTuple):
@@ -56,9 +56,8 @@ def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> 
     Return the scale of each tenth of the path, relative to the one used in dead reckoning.
 
     The dead-reckoned section is rotated, scaled and shifted onto its fixes by least squares. The
-    sigma is from the residuals of all sections, as means of a few fixes, whose power and
-    correlation a first-order process matches. Errors that are constant in a section are not
-    included.
+    sigma is that of a first-order process whose residuals match those of all sections, averaged
+    over a few fixes, in mean square and correlation. Errors constant in a section are excluded.
 
     path : (k,) path length at each fix, m, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and
     fixed positions, m.   sigma : (k,) stated for a fix, m per horizontal axis; a hundredth of its
@@ -102,7 +101,7 @@ def _similarity(source: Complexes, target: Complexes) -> Similarity:
 def _scale_sigmas(fits: list[Similarity], stated: float) -> list[float]:
     """Return the sigma of the scale of each fit; stated : sigma of a fix, m."""
     # variance and correlation of the errors are those of the first-order process whose residuals
-    # have the observed power and correlation
+    # have the observed mean square and correlation
     if not fits:
         return []
     residuals = [fit.residual for fit in fits]
@@ -117,7 +116,7 @@ def _scale_sigmas(fits: list[Similarity], stated: float) -> list[float]:
                           / square if square else 0.0, row, grid)
                 for lag, row in zip(BLOCK_LAGS, correlations, strict=True) if lag == 1 or n >= 16)
     variance = np.maximum(power, np.median(power)) / np.interp(index, grid, residual_power)
-    variance = np.maximum(variance, (0.01 * stated)**2)    # lower limit from fix to fix
+    variance = np.maximum(variance, (0.01 * stated)**2)    # its lower limit
     return [float(np.sqrt(v * np.interp(index, grid, slope_variance) / fit.spread))
             for v, fit in zip(variance, fits, strict=True)]
 

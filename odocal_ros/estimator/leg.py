@@ -102,10 +102,9 @@ class SmootherLeg:
     @property
     def uses_speed_steps(self) -> bool:
         """
-        Return True if the transitions of a coarse speed are used, not its integral.
+        Return True if only the step transitions of a coarse speed are used, not its integral.
 
-        A speed in steps of less than 0.05 m/s is integrated, with rounding noise: a minute at
-        constant speed is then at most 1 m off.
+        The integral of a speed rounded to 0.05 m/s has an error of at most 1.5 m in a minute.
         """
         coarse = self.travel.coarse
         return coarse is not None and coarse.step * self.rough_scale > 0.05

@@ -75,15 +75,15 @@ class ImuGaps:
 @lru_cache(maxsize=1)      # faults and running estimate of one update use the same leg
 def screen_thinned(leg: Leg, config: Config) -> ScreenedLeg:
     """Return the inputs of a thinned leg; its IMU rows are means over cells of time."""
-    return screen_leg(leg, _with_cells(leg, config))
+    return screen_leg(leg, _with_gap_limit(leg, config))
 
 
 def find_thinned_faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
     """Return the faults of a thinned leg."""
-    return find_faults(screen_thinned(leg, config), _with_cells(leg, config))
+    return find_faults(screen_thinned(leg, config), _with_gap_limit(leg, config))
 
 
-def _with_cells(leg: Leg, config: Config) -> Config:
+def _with_gap_limit(leg: Leg, config: Config) -> Config:
     """Return config with an IMU gap limit that cells do not exceed."""
     cell_s = float(np.median(np.diff(leg.imu.stamp_ns))) * 1e-9 if len(leg.imu.stamp_ns) > 1 \
         else 0.0

@@ -23,7 +23,7 @@ from odocal_ros.pipeline.floor_marks import HALF_MARK, mark_positions, point_pos
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement: standstill before a mark, s: its positions extend HALF_MARK to both sides, delay 0.5 s
+# judgement: standstill before a mark, s: its positions take 2 HALF_MARK, odometer delay 0.5 s
 MARK_STILL_S = 2 * HALF_MARK + 0.5
 
 
@@ -154,7 +154,7 @@ class Operation(AutomaticLegs):
         if session.state is State.RECORDING and still_s < MARK_STILL_S:
             raise CommandRefused(f'the wheels have stood for {still_s:.1f} s, required: '
                                  f'{MARK_STILL_S:g} s; stand on the point and call again')
-        delay_s = self._recording.inputs.leading_input.health.delay_s
+        delay_s = self._recording.inputs.mark_input.health.delay_s
         mark = session.mark(newest_ns - round(HALF_MARK * 1e9), newest_ns + round(delay_s * 1e9))
         self._recording.add_marks(mark_positions(session.config, [mark]), session.config)
         self.show_status()

@@ -77,8 +77,8 @@ class Inputs:
         return not (self._needs_imu or imu.publishers or imu.health.last_arrival_ns)
 
     @property
-    def leading_input(self) -> Input:
-        """Return the topic whose stamps set the marks: the IMU, or else the odometer."""
+    def mark_input(self) -> Input:
+        """Return the input whose stamps set the marks: the IMU, or else the odometer."""
         imu = self.by_slot['imu']
         return imu if self._needs_imu or imu.newest_ns else self.by_slot['odometer']
 
@@ -207,7 +207,7 @@ class Recording:
     @property
     def newest_ns(self) -> int:
         """Return the newest stamp of the leading topic, by which marks are set; 0 without one."""
-        return self.inputs.leading_input.newest_ns
+        return self.inputs.mark_input.newest_ns
 
     def has_passed(self, mark_ns: int) -> bool:
         """Return True if every topic with messages has passed a mark."""
@@ -223,7 +223,7 @@ class Recording:
 
     @property
     def has_time_jumped(self) -> bool:
-        return self._clock_has_jumped or self.inputs.leading_input.health.has_jumped_back
+        return self._clock_has_jumped or self.inputs.mark_input.health.has_jumped_back
 
     def restart(self) -> None:
         """Drop all samples, after a jump of time."""

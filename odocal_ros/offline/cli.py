@@ -37,7 +37,7 @@ COMMANDS = {      # name: (its module, or the package that has it as an entry po
     'plan': ('odocal_ros.offline.plan', 'predict the uncertainties of a planned drive'),
     'watch': ('odocal_ros.live.node_commands', 'show the progress of a running node'),
     'doctor': ('odocal_ros.offline.doctor', 'show the installation, for bug reports'),
-    'compare': ('odocal_ros.offline.compare', 'compare calibrations: changes in sigmas'),
+    'compare': ('odocal_ros.offline.compare', 'show changes between calibrations'),
     'paper': ('odocal_reproductions', 'reproduce tables 1-4 of Shi et al. 2015, two-point method'),
     'patent': ('odocal_reproductions', 'compute the example of patent CN104359492A'),
 }

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options: the calibration options of replay, and --no-browser."""
     add = parser.add_argument
     add('bag', metavar='BAG', help='bag folder or file')
-    replay.add_calibration_arguments(parser, default='selected, with the reason')
+    replay.add_calibration_arguments(parser, default='the most likely one')
     add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
     add('--force', action='store_true', help='replace an existing calibration.json')
     add('--no-browser', action='store_true', help='do not open the report')

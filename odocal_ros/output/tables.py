@@ -283,7 +283,7 @@ def check_table(
                 f'{share:.{3 if share < 100 else 0}f} %']))
     heads = [f'in {error.length:g} m' if error.length < 1000 else f'in {error.length / 1000:g} km'
              for error in per_distance]
-    return [*heads, 'rms', 'max', 'mean', 'at end', 'of path'], rows
+    return [*heads, 'rms', 'max', 'mean', 'at end', 'end/path'], rows
 
 
 def track_lines(legs: tuple[result.LegResult, ...], width: int) -> list[str]:

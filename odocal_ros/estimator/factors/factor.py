@@ -47,7 +47,7 @@ class LinearisationPoint:
     priors: Priors
     # (K, VARIANCE_FACTOR_COUNT) factors on the variances of outlier intervals; None: 1
     variance_factors: np.ndarray | None
-    fitted: bool = False       # residuals are noise: see ``Motion``
+    fitted: bool = False       # near the solution: see ``Motion``
 
 
 class Factor:
@@ -55,14 +55,14 @@ class Factor:
     Base class of the factors, without any rows. ``equations.FACTORS`` lists the factors.
 
     A subclass implements ``__init__(problem, point)`` and overrides what differs. N keyframes of n
-    unknowns have K = N - 1 intervals; m constants are in use.
+    unknowns have K = N - 1 intervals; the first m of the M constants are in use.
     """
 
     name: ClassVar[str]
     state: State
     levels: Levels           # of a weighted copy, as n and m
-    n: int                   # number of unknowns of a keyframe
-    m: int                   # number of constants: no row depends on later ones
+    n: int                   # unknowns of a keyframe, with or without the slow fix error
+    m: int                   # number of constants in use
     log_R: float = 0.0       # log determinant of the covariance of the rows, plus a constant
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
@@ -112,7 +112,7 @@ class Factor:
         """Add the right-hand sides of its levels: docs/method.md (S27b)."""
 
     def effects(self, marginals: JointMarginals) -> Iterable[tuple[str, Floats]]:
-        """Yield budget sources, (S32): effects of unit errors on ln K, yaw, pitch, (..., 3, k)."""
+        """Yield budget sources (S32), effects of unit errors on ln K, yaw, pitch: (..., 3, k)."""
         return ()
 
     def parameter_covariances(self, covariances: Floats) -> Floats:
