@@ -115,7 +115,7 @@ def _posterior(problem: Problem, fit: Fit, factor: float, slips: tuple[residuals
         slip = abs(sum(slip.metres for slip in slips))
         travel_errors['slip'] = slip / residuals.path_length(fit)
     if unexplained:
-        travel_errors['unexplained_travel'] = unexplained.share
+        travel_errors['unexplained_travel'] = unexplained.error
     beyond_fit = remarks.find_errors_beyond_fit(problem, fit, np.sqrt(np.diag(covariance)),
                                                 travel_errors)
     for error in beyond_fit:
