@@ -76,12 +76,12 @@ def release_mapped_memory() -> None:
 
 def blocks(n: int) -> Iterator[slice]:
     """
-    Yield slices of n rows, of at most 64 rows and nearly equal length, for stacks of matrices.
+    Yield slices of n rows, of at most 48 rows and nearly equal length, for stacks of matrices.
 
     No slice has a single row if n > 1: numpy multiplies a single matrix differently from a stack,
     and results must not depend on the slices. Mapped memory is released periodically.
     """
-    max_rows = 64      # their matrices stay in the cache
+    max_rows = 48      # their matrices stay in the cache
     edges = np.linspace(0, n, max(1, math.ceil(n / max_rows)) + 1).astype(int)
     for first, last in pairwise(edges.tolist()):
         yield slice(first, last)

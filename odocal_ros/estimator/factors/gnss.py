@@ -71,7 +71,7 @@ class Fixes(PointRows):
         # determine these errors (decision 9)
         fitted = rotate(transpose(self.C), np.diff(state.v_n, axis=0)[k] / T[:, None] - g)
         measured = point.intervals.dv[k] / T[:, None]
-        self.signal_noise = force_signals(fitted - measured) * point.fitted
+        self.force_noise = (fitted - measured) * point.fitted
         # effects of a filter and of an odometer in the receiver, and their derivatives
         track = (state.t, *antenna_motion(state, point.intervals.mean_rate, arm_b),
                  state.t[k] + points.tau)
@@ -115,7 +115,8 @@ class Fixes(PointRows):
         J_c[:, :, layout.FIX_LAG2] = -self.by_lag
         J_c[:, :, layout.FIX_BY_MOTION] = -self.by_motion
         J_c[:, :, layout.FIX_MOTION_TIME] = -self.by_time
-        J_c[:, :, layout.ACCEL] = self.C @ (self.points.FF + self.signal_noise * tau**2 / 2)
+        J_c[:, :, layout.ACCEL] = self.C @ (
+            self.points.FF + force_signals(self.force_noise) * tau**2 / 2)
         return J, J_c
 
     @classmethod

@@ -70,6 +70,10 @@ TURNING_RATE = 0.05
 MIN_REST_NOISE = 5e-4
 # rad/s, m/s^2, 1 sigma of the unknown motion within a gap: judgement, of a car in town
 GAP_RATE, GAP_FORCE = 0.1, 1.5
+# definition: rows with variances that are not estimated, equal on all three axes; the last is
+# the odometer
+KNOWN = (P, V, PHI, D)
+KNOWN_ROWS, ODOMETER = np.concatenate([np.arange(ROWS)[rows] for rows in KNOWN]), 3
 ABSENT_VARIANCE = 1e4   # m^2, variance of travel that is not observed
 
 
@@ -129,7 +133,7 @@ class IntervalNoise:
     axes: Floats                # (K, 3, 3) axes of the vehicle in n; rows: forward, left, up
     imu: Floats                 # (K, 4) roots of the variance factors of IMU
     road: Floats                # (K, 6) displacement by unit noises of ROAD along their axes
-    known_variances: Floats     # (K, 18) of the rows, not estimated
+    known_variances: Floats     # (K, 4) of the rows of KNOWN, not estimated
     known_columns: Floats       # (K, 18, g) effects of unit noises that are not estimated either
     component: ClassVar[Ints] = np.array(       # (c,) index in INTERVAL of each unit noise
         len(GAUSS_X) * [INTERVAL.index(name) for name in IMU for _ in range(3)]
@@ -180,7 +184,7 @@ class IntervalNoise:
         Q = units @ np.swapaxes(units, 1, 2)
         known = self.known_columns[rows]
         Q += known @ np.swapaxes(known, 1, 2)
-        Q[:, range(ROWS), range(ROWS)] += self.known_variances[rows]
+        Q[:, KNOWN_ROWS, KNOWN_ROWS] += np.repeat(self.known_variances[rows], 3, axis=1)
         return Q
 
 
@@ -207,9 +211,9 @@ def motion_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
                      for axis, magnitude in zip(ROAD.values(), magnitudes, strict=True)], -1)
     known_variances = _known_variances(motion, leg)
     rest_variance = rest_noise(speed, rest)
-    known_variances[rest, D] += rest_variance
+    known_variances[rest, ODOMETER] += rest_variance
     slow = ~rest & (speed < 1.0)
-    known_variances[slow, D] += rest_variance * (1 - speed[slow, None])
+    known_variances[slow, ODOMETER] += rest_variance * (1 - speed[slow])
     return IntervalNoise(motion, axes, np.sqrt(variance_factors[:, IMU_NOISE]), road,
                          known_variances, _known_columns(motion, leg, axes, rest))
 
@@ -259,25 +263,24 @@ def accelerating_and_turning(motion: Motion) -> tuple[Bools, Bools]:
 
 
 def _known_variances(motion: Motion, leg: SmootherLeg) -> Floats:
-    """Return variances of the motion within gaps and outside the odometer samples: (K, 18)."""
+    """Return variances of the motion within gaps and outside the odometer samples: (K, 4)."""
     sums, T = motion.sums, motion.T[:, 0]
-    variances = np.zeros((len(T), ROWS))
+    variances = np.zeros((len(T), len(KNOWN)))
     # s: motion within a longer step between IMU samples is unknown
     gap = np.where(sums.longest_step > max(0.06, 3 * np.median(sums.longest_step)),
                    sums.longest_step, 0.0)
-    variances[:, PHI] = (GAP_RATE * gap[:, None])**2
-    variances[:, V] = (GAP_FORCE * gap[:, None])**2
-    variances[:, P] = (GAP_FORCE * gap * T)[:, None]**2
+    variances[:, :ODOMETER] = np.stack(
+        [GAP_FORCE * gap * T, GAP_FORCE * gap, GAP_RATE * gap], -1)**2
     t, travel = motion.state.t, leg.travel
     stamp = stamp_of(t, motion.state.constants)
     outside = (stamp[:-1] < travel.t[0]) | (stamp[1:] > travel.t[-1])
-    variances[outside, D] = ABSENT_VARIANCE
-    variances[:, D] += _gap_variances(stamp, travel, motion.state.scale)[:, None]
+    variances[outside, ODOMETER] = ABSENT_VARIANCE
+    variances[:, ODOMETER] += _gap_variances(stamp, travel, motion.state.scale)
     for t_step, sigma in zip(leg.uncertain_t, leg.uncertain_sigma, strict=True):
         k = np.searchsorted(t, t_step) - 1
         if 0 <= k < len(T) and sigma > 0:
             intervals = slice(max(k - 1, 0), k + 2)       # the gap may begin one interval earlier
-            variances[intervals, D] += (motion.state.scale * sigma)**2
+            variances[intervals, ODOMETER] += (motion.state.scale * sigma)**2
     return variances
 
 

@@ -62,18 +62,19 @@ class MotionRows(Factor):
         self._noise_estimates: tuple[ref[JointMarginals], Floats, Floats] | None = None
         self.whiten = work_array(len(self.raw), ROWS, ROWS)
         self.J = work_array(*self.raw.shape, 2 * self.n + self.m)
-        self.r, logs = np.empty((2, len(self.raw), ROWS))
+        self.r, log_sum = np.empty_like(self.raw), 0.0
         for rows in blocks(len(self.raw)):
             units = self.noise.columns(rows) * self.level_sigmas()
             Q = self.noise.covariance(units, rows)
             scale = 1 / np.sqrt(np.einsum('kii->ki', Q))
             root = np.linalg.cholesky(Q * scale[:, :, None] * scale[:, None, :])
             self.whiten[rows] = np.linalg.inv(root) * scale[:, None, :]
-            logs[rows] = np.log(np.einsum('kii->ki', self.whiten[rows]).copy())     # see arctan2
+            diagonal = np.einsum('kii->ki', self.whiten[rows]).copy()      # see arctan2
+            log_sum += np.log(diagonal).sum()
             self.r[rows] = np.einsum('kij,kj->ki', self.whiten[rows], self.raw[rows])
             self.J[rows] = self.whiten[rows] @ np.concatenate(
                 self.derivatives(rows, units), axis=2)[:, :, :self.J.shape[2]]
-        self.log_R = -2 * logs.sum()
+        self.log_R = -2 * float(log_sum)
 
     def apply_step(self, step: Floats, constants: Floats, new_state: State) -> None:
         r, n = self.r.copy(), self.n
