@@ -65,10 +65,10 @@ def test_exhausted_memory_is_reported_as_such(bag):
     script = ('import resource, sys\n'
               'from odocal_ros.offline.cli import main\n'
               'import odocal_ros.bagio.mcap_file as m, odocal_ros.offline.inspect_bag\n'
-              'given = m.McapFile._entries\n'
-              'def entries(self, records, cut):\n'
+              'def read_chunk(self, index):\n'
               '    raise MemoryError\n'
-              'm.McapFile._entries = entries\n'
+              'assert m.McapFile._read_chunk\n'
+              'm.McapFile._read_chunk = read_chunk\n'
               f'sys.exit(main(["inspect", {str(bag)!r}]))\n')
     ran = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
                          check=False)
