@@ -199,24 +199,29 @@ def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
             rows.append(k)
             sizes.append(size)
     last_rows, size_s = np.array(rows, np.int64), np.array(sizes)
-    decrease = _decrease_of_least_lag(samples.received_ns, lag, last_rows)
-    stays = np.abs(decrease - size_s) <= STEP_TOLERANCE * np.abs(size_s)
+    stays = _are_lasting_steps(samples, lag, last_rows, size_s)
     return last_rows[stays], size_s[stays]
 
 
-def _decrease_of_least_lag(received_ns: Ints, lag: Floats, last_rows: Ints) -> Floats:
+def _are_lasting_steps(samples: Samples, lag: Floats, last_rows: Ints, size_s: Floats) -> Bools:
     """
-    Return the least lag before the ends of sections minus that after them, (m,) s.
+    Return whether the least lag changes by these steps, and arrivals are in real time: (m,).
 
     Within QUEUE_TIME and the adjacent sections.   last_rows : (m,) last rows of sections.
     """
+    received_ns, stamp_ns = samples.received_ns, samples.stamp_ns
     edges = np.concatenate([[0], last_rows + 1, [len(lag)]])
     first, last = (np.searchsorted(received_ns, received_ns[last_rows] + sign * round(
         QUEUE_TIME * 1e9)) for sign in (-1, 1))
     first = np.minimum(np.maximum(first, edges[:-2]), last_rows)
     last = np.maximum(np.minimum(last, edges[2:]), last_rows + 2)
-    return np.array([lag[i:k + 1].min() - lag[k + 1:j].min()
-                     for i, k, j in zip(first, last_rows, last, strict=True)])
+
+    def is_in_real_time(rows: slice) -> bool:      # not played back faster
+        return bool(2 * np.ptp(received_ns[rows]) >= np.ptp(stamp_ns[rows]))
+
+    return np.array([abs(lag[i:k + 1].min() - lag[k + 1:j].min() - size) <= STEP_TOLERANCE * abs(
+        size) and is_in_real_time(slice(i, k + 1)) and is_in_real_time(slice(k + 1, j))
+        for i, k, j, size in zip(first, last_rows, last, size_s, strict=True)], dtype=bool)
 
 
 def late_clocks(inputs: Inputs, located: LocatedFixes) -> Iterator[tuple[str, float]]:
