@@ -205,7 +205,7 @@ def _clock_steps(samples: Samples) -> tuple[Ints, Floats]:
 
 def _are_lasting_steps(samples: Samples, lag: Floats, last_rows: Ints, size_s: Floats) -> Bools:
     """
-    Return whether the least lag changes by these steps, and arrivals are in real time: (m,).
+    Return a mask of the steps by which the least lag changes, with arrivals in real time: (m,).
 
     Within QUEUE_TIME and the adjacent sections.   last_rows : (m,) last rows of sections.
     """
