@@ -121,9 +121,9 @@ class Axle:
 
         mean_rate : (K, 3) rad/s in b, mean turn rates.
 
-        Of the pitch: forward acceleration by traction, by braking, m/s^2, and the rate of change
-        of their sum, m/s^3. Of the yaw: acceleration to the left and its rate of change. They
-        include the components of gravity along a slope and a bank.
+        Of the pitch: forward acceleration from traction and from braking, m/s^2, and the rate of
+        change of their sum, m/s^3. Of the yaw: acceleration to the left and its rate of change.
+        They include the components of gravity along a slope and a bank.
         """
         T, speed = np.diff(self.state.t), self._forward_speed(self.v_n)
         # by speed and turn rate: a velocity difference of the axle has the noise of two turn rates
@@ -147,7 +147,7 @@ class Axle:
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + by_slope
 
     def tyre_signals(self, sums: Intervals) -> tuple[Floats, Floats]:
-        """Return the signals of TYRES in each interval, (K, 5), and those of K, (5,)."""
+        """Return the signals of TYRES in each interval, (K, 5), and where K is stated, (5,)."""
         state = self.state
         path = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
