@@ -108,8 +108,7 @@ def test_files_that_are_shorter_than_listed_missing_or_empty_are_reported(tmp_pa
     assert '6.0 s at the end, listed in metadata.yaml,' in truncated(read(path)[1])
     (path / 'metadata.yaml').write_text(
         metadata.replace('- drive.mcap\n', '- drive.mcap\n  - b_1.mcap\n'))
-    assert '1 of 2 files named in metadata.yaml are missing (b_1.mcap)' in truncated(
-        read(path)[1])
+    assert '1 of 2 files named in metadata.yaml are missing (b_1.mcap)' in truncated(read(path)[1])
     (path / 'b_1.mcap').write_bytes(b'')
     found, notes = read(path)
     assert 'b_1.mcap: an empty file' in truncated(notes)

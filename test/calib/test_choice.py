@@ -50,8 +50,7 @@ def test_each_value_comes_from_the_first_method_that_is_not_rejected():
     assert chosen(several(fell, ends), 'auto')[0] == 2.0
     # all methods are rejected; only one is required
     assert chosen(several(fell, refused), 'auto') == (2.1, ('smoother',))
-    assert chosen(several(method('smoother', 2.1), refused), 'two_point') == (
-        None, ('two_point',))
+    assert chosen(several(method('smoother', 2.1), refused), 'two_point') == (None, ('two_point',))
     assert choice.choose(several(ends), 'wheels') == ({}, ())
 
 

@@ -38,8 +38,7 @@ def of_grade(config, *names):
     ('tactical', 'rtk', 250.0, 5e-4, 5e-4),
     # a quarter of the grade's error, not determined by correlated fixes: common size of the axes
     ('consumer', 'correlated', 200.0, 0.01 / 4, 0.01)])
-def test_accelerometer_scale_error_is_within_its_sigma(grade, noise, seconds, error,
-                                                                size):
+def test_accelerometer_scale_error_is_within_its_sigma(grade, noise, seconds, error, size):
     drive, config, leg = made(scenario='town', duration=seconds, imu_grade=grade,
                               fix_noise=noise, accel_scale_error=error, seed=4)
     result = smooth(leg, of_grade(config, 'accel_scale'))

@@ -43,8 +43,7 @@ def test_quantisation_step_is_found_and_explains_only_noise_of_its_size():
 def problem(leg, rest):
     """Return the input of the cause search; rest: s of standstill before the drive."""
     keys = np.arange(0.0, leg.t_imu[-1], 1.0)
-    return SimpleNamespace(leg=leg, at_rest=keys < rest,
-                           imu=SimpleNamespace(t_keyframes=keys))
+    return SimpleNamespace(leg=leg, at_rest=keys < rest, imu=SimpleNamespace(t_keyframes=keys))
 
 
 def noisy(moving, rest, rest_s=60.0, n=20_000):

@@ -131,8 +131,7 @@ def test_lean_axes_are_level_with_a_rolled_imu():
     drive, problem, state = at_truth(roll=roll)
     motion = Equations(problem, state).factors['motion'].motion
     C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
-    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(
-        layout.SIZE_WITHOUT_SLOW)[2][:, 15:18]
+    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(layout.SIZE_WITHOUT_SLOW)[2][:, 15:18]
     # the pitch axis of the mounting is level to second order of yaw and pitch, 1 deg each
     for columns, axis in ((layout.PITCH_LEAN, 1), (layout.YAW_LEAN, 2)):
         sizes = np.linalg.norm(by[..., columns], axis=1).max(axis=0)

@@ -21,8 +21,7 @@ DEG = np.pi / 180
 
 def found(made, config=None, leg=None):
     e = drives.two_point(leg or made.leg(), config or drives.settings(made)).estimates
-    return e['scale_factor'].value, e['yaw_mounting_angle'].value, \
-        e['pitch_mounting_angle'].value
+    return e['scale_factor'].value, e['yaw_mounting_angle'].value, e['pitch_mounting_angle'].value
 
 
 @pytest.mark.parametrize('options', [

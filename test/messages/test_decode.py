@@ -267,7 +267,6 @@ def test_damaged_messages_are_omitted_and_counted():
 
 
 def test_a_missing_joint_gives_no_rows_and_the_reason():
-    found, reader = read('odometer', [make.joints(1, ['a'], [1.0])],
-                         odometer__field='velocity[b]')
+    found, reader = read('odometer', [make.joints(1, ['a'], [1.0])], odometer__field='velocity[b]')
     assert found == {}
     assert reader.error == 'no velocity[b] in a sensor_msgs/msg/JointState; names: a'

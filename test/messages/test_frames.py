@@ -60,8 +60,7 @@ def test_one_frame_is_used_for_any_division_into_blocks(little_endian):
         found, _ = read(frames, pieces, little_endian=little_endian)
         assert found.keys() == whole.keys()
         for slot in whole:
-            for one, other in zip(columns_of(found[slot]), columns_of(whole[slot]),
-                                  strict=True):
+            for one, other in zip(columns_of(found[slot]), columns_of(whole[slot]), strict=True):
                 assert one.tobytes() == other.tobytes()
 
 

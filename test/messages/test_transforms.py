@@ -62,8 +62,7 @@ def raws(*series):
 BY_SLAM, BY_WHEELS = (corrections, 'odom', 'map'), (driven, 'base_link', 'odom')
 MOVING = raws((T_MAP, *BY_SLAM), (T_ODOM, *BY_WHEELS))
 SLOW = raws((T_ODOM, *BY_SLAM), (T_MAP, *BY_WHEELS))
-THREE = raws((T_ODOM, *BY_SLAM), (T_MAP, *BY_WHEELS),
-             (T_MAP + 0.07, driven, 'prism', 'base_link'))
+THREE = raws((T_ODOM, *BY_SLAM), (T_MAP, *BY_WHEELS), (T_MAP + 0.07, driven, 'prism', 'base_link'))
 STATIC = message(one(0.0, ARM, Rotation.from_euler('Z', 1.0), 'prism', 'base_link'))
 
 

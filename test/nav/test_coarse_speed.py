@@ -201,8 +201,7 @@ def test_a_held_speed_with_reversed_counts_has_the_other_side():
 
 # forwards and backwards, with different accelerations at stops and starts
 CORNERS = np.cumsum(np.tile([3.0, 1.5, 6.0, 2.1], 20))
-BOTH_DIRECTIONS = np.interp(AT, np.r_[0.0, CORNERS],
-                            np.r_[0.0, np.tile([0.0, 1.7, 1.7, 0.0], 20)])
+BOTH_DIRECTIONS = np.interp(AT, np.r_[0.0, CORNERS], np.r_[0.0, np.tile([0.0, 1.7, 1.7, 0.0], 20)])
 BOTH_DIRECTIONS[CORNERS[39] < AT] *= -1
 BAND = 0.25
 
@@ -274,7 +273,6 @@ def test_error_of_an_odometer_in_the_receiver_is_high_pass_filtered():
 def test_path_is_extrapolated_straight_beyond_its_ends():
     t = np.arange(0.0, 10.0)
     place = np.stack([3.0 * t, 0 * t], -1)
-    late, _ = filter_error(t, place, np.tile([3.0, 0.0], (10, 1)), np.array([0.0, 5.0, 9.0]),
-                              4.0)
+    late, _ = filter_error(t, place, np.tile([3.0, 0.0], (10, 1)), np.array([0.0, 5.0, 9.0]), 4.0)
     # at constant velocity the error is a delay of tau only, which is in the delay parameter
     assert_allclose(late, 0.0, atol=1e-12)

@@ -235,8 +235,7 @@ def test_no_axes_are_given_without_an_accelerometer(tmp_path, capsys):
 
 def test_a_component_of_a_velocity_is_not_called_speed(tmp_path, capsys):
     made = drive(scenario='yard', duration=300.0, seed=4, fix_sigma=0.2, velocity_sigma=0.05)
-    found, text = inspected(plain(
-        tmp_path / 'bag', made, velocity('/vel', made.velocity)), capsys)
+    found, text = inspected(plain(tmp_path / 'bag', made, velocity('/vel', made.velocity)), capsys)
     block = text.partition('\n/vel\n')[2].partition('\n\n')[0]
     assert block.strip().startswith('one component of a velocity')
     assert found['not_following'] == ['/vel']

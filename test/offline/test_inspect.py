@@ -165,8 +165,7 @@ def test_odd_stamps_and_gaps_are_counted(inspect_drive):
     timing = topic(seen, '/imu/data')['timing']
     assert [timing[k] for k in ('zero_stamps', 'backward_steps', 'repeated_stamps')] == [1, 1, 1]
     longest = max(timing['gaps'], key=lambda gap: gap['length'])
-    assert [longest['length'], longest['at']] == pytest.approx(
-        [600 / RATE, 2000 / RATE], abs=0.05)
+    assert [longest['length'], longest['at']] == pytest.approx([600 / RATE, 2000 / RATE], abs=0.05)
     assert topic(seen, '/imu/data')['rate_hz'] == pytest.approx(RATE, rel=0.01)
     assert f'the longest of {longest["length"]:.2f} s at t = {longest["at"]:.2f} s' in text
     assert {'BAD_ROWS_DROPPED', 'STAMPS_NOT_RISING'} <= codes(seen)

@@ -86,8 +86,7 @@ def evil(tmp_path_factory):
                       encode.fix('/a\ntouch ran\x1b[2J', made.fix)])
 
 
-def test_replay_escapes_hostile_names_in_output_and_files(
-        evil, tmp_path, monkeypatch, capsys):
+def test_replay_escapes_hostile_names_in_output_and_files(evil, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(['replay', str(evil), *FIX, '--set', 'alignment.heading=0.7', '--set',
                  'output.formats=[params, autoware, transform, track, legs]']) in (0, 1)

@@ -116,8 +116,7 @@ def test_rows_with_random_delays_are_corrected_to_the_regular_interval(made, tru
 def test_arrival_jitter_is_measured(made, lost):
     """Of an exponential distribution 95 % in the middle are 3.66 means wide."""
     late = arrivals(made.odometer, 0.005, lost)
-    assert late_rows.arrival_jitter(since_first(late)) == pytest.approx(
-        0.005 * 3.66 / 4, rel=0.1)
+    assert late_rows.arrival_jitter(since_first(late)) == pytest.approx(0.005 * 3.66 / 4, rel=0.1)
     t = since_first(made.odometer)
     assert late_rows.arrival_jitter(t) == pytest.approx(0.0, abs=1e-9)
     assert late_rows.arrival_jitter(t[:10]) is None

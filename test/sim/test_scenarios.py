@@ -223,8 +223,7 @@ def test_a_bag_contains_the_positions_of_the_leg(kind, tmp_path):
     fix = read_bag(bag, {'imu': '/imu/data', 'odometer': '/odometer/left',
                          'fix': topic}).samples('fix')
     assert (fix.status == LOCAL_STATUS).all()
-    for name in ('stamp_ns', 'latitude', 'longitude', 'height', 'covariance_n',
-                 'covariance_type'):
+    for name in ('stamp_ns', 'latitude', 'longitude', 'height', 'covariance_n', 'covariance_type'):
         np.testing.assert_array_equal(getattr(fix, name), getattr(leg.fix, name), name)
     if REFERENCES[kind].is_planar:
         assert (made.positions()[:, 2] == 0.0).all()
