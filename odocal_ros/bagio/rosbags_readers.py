@@ -18,6 +18,7 @@ import threading
 from typing import Any
 
 from odocal_ros.bagio.bag_file import BagFile, Channel
+from odocal_ros.bagio.known_types import KNOWN_DEFINITIONS
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
 from odocal_ros.safe_io import limits
 from odocal_ros.safe_io.limits import Allowance, LATEST_NS, limit_factor, LimitReached
@@ -27,6 +28,9 @@ IDL_SEPARATOR = '=' * 80 + '\n'
 # of IDL: string, comments, annotation, bracket, other text
 TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',
                    re.DOTALL)
+UNDEFINED_TYPE = (
+    '{} is not a standard message type and the bag holds no definition of it; convert the bag '
+    "to mcap with 'ros2 bag convert' where its package is installed, or use another topic")
 # names of compressions in ``Allowance.unpack``, by those of rosbags
 COMPRESSIONS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
 
@@ -100,11 +104,11 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 class Types:
-    """Deserialises messages of standard types and of those defined in a bag, by rosbags."""
+    """Deserialises messages of standard, known and bag-defined types, by rosbags."""
 
     def __init__(self) -> None:
         self._store: Any = None
-        self._definitions: dict[str, tuple[str, str]] = {}
+        self._definitions: dict[str, tuple[str, str]] = {}      # of the bag
 
     def define(self, msgtype: str, definition: tuple[str, str]) -> None:
         """Store the definition of a type, (form, text); it is parsed when it is needed."""
@@ -139,11 +143,10 @@ class Types:
         return self._store
 
     def _register(self, msgtype: str) -> None:
-        form, text = self._definitions.get(msgtype, ('', ''))
+        known = ('msg', KNOWN_DEFINITIONS[msgtype]) if msgtype in KNOWN_DEFINITIONS else ('', '')
+        form, text = self._definitions.get(msgtype, known)
         if not form:
-            raise BadData(f'{msgtype} is not a standard message type and the bag holds no '
-                          'definition of it: record with a current rosbag2 (mcap), or use '
-                          'another topic')
+            raise BadData(UNDEFINED_TYPE.format(msgtype))
         limits.check(len(text), limits.DEFINITION_CHARACTERS,
                      f'{msgtype}: its definition in the bag', 'characters')
         try:

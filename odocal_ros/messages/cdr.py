@@ -56,6 +56,8 @@ _GPS_FIX = (      # format: of gps_msgs; the status has its own header and lists
         'tdop', 'err', 'err_horz', 'err_vert', 'err_track', 'err_speed', 'err_climb', 'err_time',
         'err_pitch', 'err_roll', 'err_dip')),
     'float64[9] position_covariance', 'uint8 position_covariance_type')
+_VELOCITY_REPORT = (*HEADER, 'float32 longitudinal_velocity', 'float32 lateral_velocity',
+                    'float32 heading_rate')
 FRAME_OFFSET = 16       # format: offset of the text of header.frame_id in CDR
 _LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
 _DIM = ('string label', 'uint32 size', 'uint32 stride')
@@ -88,9 +90,8 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     'nav_msgs/msg/Odometry': (
         *HEADER, 'string child_frame_id', *_pose('pose.pose'), 'float64[36] pose.covariance',
         *_twist('twist.twist'), 'float64[36] twist.covariance'),
-    'autoware_vehicle_msgs/msg/VelocityReport': (
-        *HEADER, 'float32 longitudinal_velocity', 'float32 lateral_velocity',
-        'float32 heading_rate'),
+    'autoware_vehicle_msgs/msg/VelocityReport': _VELOCITY_REPORT,
+    'autoware_auto_vehicle_msgs/msg/VelocityReport': _VELOCITY_REPORT,    # of Autoware until 2024
     'std_msgs/msg/Int32MultiArray': (*_LAYOUT, 'int32[] data'),
     'std_msgs/msg/Int64MultiArray': (*_LAYOUT, 'int64[] data'),
 } | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in NUMBER_TYPES}

@@ -36,6 +36,7 @@ DEFAULT_FIELD = {
     f'{TWIST}WithCovarianceStamped': 'twist.twist.linear.x',
     'nav_msgs/msg/Odometry': 'twist.twist.linear.x',
     'autoware_vehicle_msgs/msg/VelocityReport': 'longitudinal_velocity',
+    'autoware_auto_vehicle_msgs/msg/VelocityReport': 'longitudinal_velocity',
     'std_msgs/msg/Int32MultiArray': 'data',
     'std_msgs/msg/Int64MultiArray': 'data',
 } | {f'std_msgs/msg/{name}': 'data' for name in cdr.NUMBER_TYPES}

@@ -154,6 +154,31 @@ def test_foreign_types_are_read_by_the_definitions_in_the_bag(tmp_path):
         bag.read({'/ticks': make_reader('odometer', name, settings)}, print)
 
 
+@pytest.mark.parametrize(('name', 'field_type', 'field'), [
+    ('irobot_create_msgs/msg/WheelTicks', 'int32', 'ticks_left ticks_right'),
+    ('dbw_ford_msgs/msg/WheelSpeedReport', 'float32',
+     'front_left front_right rear_left rear_right'),
+    ('pacmod3_msgs/msg/WheelSpeedRpt', 'float64',
+     'front_left_wheel_speed front_right_wheel_speed '
+     'rear_left_wheel_speed rear_right_wheel_speed')])
+def test_known_types_are_read_from_bags_without_definitions(tmp_path, name, field_type, field):
+    from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+    store, fields = get_typestore(Stores.ROS2_JAZZY), field.split()
+    store.register(get_types_from_msg('std_msgs/Header header\n' + ''.join(
+        f'{field_type} {field}\n' for field in fields), name))
+    rows = [('/wheels', T0 + i, bytes(store.serialize_cdr(store.types[name](
+        make.header(T0 + i), *(10 * i + k for k in range(len(fields)))), name))) for i in range(5)]
+    path = ros_bags.write(tmp_path / 'bag', rows, 'sqlite3', types={'/wheels': name}, store=store)
+    with closing(sqlite3.connect(path / 'bag.db3')) as db, db:
+        db.execute('DELETE FROM message_definitions')
+    last_field = with_settings(Config(), {'odometer.field': fields[-1]})
+    with open_bag(path) as bag:
+        reader, recorder = make_reader('odometer', name, last_field), LegRecorder()
+        bag.read({'/wheels': reader}, recorder.feed)
+    assert recorder.rows('odometer').value.tolist() == [
+        10 * i + len(fields) - 1 for i in range(5)]
+
+
 def test_checksums_agree_with_sha256sum(data_dir, plain):
     with open_bag(plain) as bag:
         assert bag_sha256(bag) == hashlib.sha256((plain / 'drive.mcap').read_bytes()).hexdigest()

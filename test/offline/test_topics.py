@@ -187,6 +187,8 @@ JOINTS = 'sensor_msgs/msg/JointState'
 
 @pytest.mark.parametrize(('right', 'wrong'), [
     ({'/vehicle/status/velocity_status': VELOCITY}, {'/localization/kinematic_state': ODOM}),
+    ({'/vehicle/status/velocity_status': VELOCITY.replace('autoware', 'autoware_auto')},
+     {'/localization/kinematic_state': ODOM}),
     ({'/wheel/odom': ODOM}, {'/zed/zed_node/odom': ODOM}),
     ({'/mavros/wheel_odometry/odom': ODOM}, {'/mavros/local_position/odom': ODOM}),
     ({'/odom': ODOM}, {'/lio_sam/mapping/odometry_incremental': ODOM}),
