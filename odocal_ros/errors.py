@@ -19,6 +19,10 @@ class BadData(OdocalError):
     """Samples break their contract (shape, type): correct the source."""
 
 
+class UndefinedType(BadData):
+    """Messages have a type that neither ROS nor the bag defines."""
+
+
 class BadBag(OdocalError):
     """A recording is missing, unreadable or holds nothing usable."""
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from odocal_ros.bagio.bag_file import BagFile, Channel
 from odocal_ros.bagio.known_types import KNOWN_DEFINITIONS
-from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
+from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError, UndefinedType
 from odocal_ros.safe_io import limits
 from odocal_ros.safe_io.limits import Allowance, LATEST_NS, limit_factor, LimitReached
 
@@ -146,7 +146,7 @@ class Types:
         known = ('msg', KNOWN_DEFINITIONS[msgtype]) if msgtype in KNOWN_DEFINITIONS else ('', '')
         form, text = self._definitions.get(msgtype, known)
         if not form:
-            raise BadData(UNDEFINED_TYPE.format(msgtype))
+            raise UndefinedType(UNDEFINED_TYPE.format(msgtype))
         limits.check(len(text), limits.DEFINITION_CHARACTERS,
                      f'{msgtype}: its definition in the bag', 'characters')
         try:

@@ -107,14 +107,26 @@ def wrong_axis_reasons(inputs: Inputs, located: LocatedFixes,
             return _inverted_turns(orientation, wrong_axes, names)
     if not wrong_axes:
         return ()
+    text = '; '.join(axis.text for axis in wrong_axes)
+    if not inputs.has_accelerometer and len(wrong_axes) == 1:
+        return (Reason(Code.GYRO_AXES, text, _upright_remedy(wrong_axes[0], names[2])),)
     action = '; '.join(
         f'negate angular_velocity.{published}' if published == true[-1] else
         f'publish the value of angular_velocity.{published}{", negated," * (true[0] == "-")} as '
         f'angular_velocity.{true[-1]}' for published, true, _ in wrong_axes)
     if len(wrong_axes) == 1 and wrong_axes[0].published != wrong_axes[0].true[-1]:
         action += '; then check the other axes'
-    return (Reason(Code.GYRO_AXES, '; '.join(axis.text for axis in wrong_axes),
+    return (Reason(Code.GYRO_AXES, text,
                    f'Correct the IMU driver: {action}. {NO_ROTATION}'),)
+
+
+def _upright_remedy(axis: WrongAxis, up: str) -> str:
+    """Return the action for a gyro without accelerometer whose upright axis is not z."""
+    minus = axis.true.startswith('-') ^ up.startswith('-')
+    angle = -np.pi / 2 if minus ^ (axis.published == 'x') else np.pi / 2
+    rpy = [0, round(angle, 4), 0] if axis.published == 'x' else [round(angle, 4), 0, 0]
+    return (f'Set imu.mounting_rpy to {rpy}: {"-" * minus}{axis.published} points up then. If the '
+            'IMU is upright, correct the order of the axes in its driver.')
 
 
 def _inverted_turns(orientation: ImuOrientation, wrong_axes: list[WrongAxis],

@@ -32,6 +32,8 @@ ESTIMATES = re.compile(
     'camera[0-9]*|t265|slam|rtabmap|novatel|oem7|vectornav|applanix|microstrain|xsens)(?=[/_]|$)|'
     'filtered|fused|ekf|estimat|gps|gnss|fix|global|ground_truth|localiz|mapping|kinematic_state|'
     'visual|lidar|laser|vins|steer')
+# names of positions by a filter of the receiver or the robot, which include IMU and often wheels
+FUSED_FIXES = re.compile('(?:^|[/_])(?:ins|ekf|ukf|filter|odometry)(?=[/_]|$)|filtered|fused')
 GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 
 NO_MESSAGES_REMEDY = 'Check the driver and the QoS of the recorder, then record again.'
@@ -109,7 +111,7 @@ def candidates(topics: Topics, slot: str, config: Config, mapping: dict[str, str
         fixes = [name for name in names if topics[name].msgtype in GEODETIC]
         names = [name for name in fixes if topics[name].msgtype == FIX] or fixes or [
             name for name in names if not _contains(name, (*COMMANDS, *GOALS))]
-        names = _prefer_without(names, ('filtered', 'fused'))
+        names = [name for name in names if not FUSED_FIXES.search(name.lower())] or names
     elif slot == 'fix_velocity':
         names = [name for name in names if _is_of_receiver(name)]
         # by the name of the node's input
@@ -119,7 +121,12 @@ def candidates(topics: Topics, slot: str, config: Config, mapping: dict[str, str
 
 def without_estimates(names: list[str]) -> list[str]:
     """Return the topics whose name is not that of an estimate; all, if none are left."""
-    return [name for name in names if not ESTIMATES.search(name.lower())] or names
+    return [name for name in names if not is_estimate(name)] or names
+
+
+def is_estimate(name: str) -> bool:
+    """Return True if the name of a topic is that of an estimate, not of wheels."""
+    return ESTIMATES.search(name.lower()) is not None
 
 
 def _check_reference(mapping: dict[str, str]) -> None:

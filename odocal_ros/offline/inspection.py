@@ -18,7 +18,7 @@ from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.errors import OdocalError
-from odocal_ros.library.topics import REFERENCES
+from odocal_ros.library.topics import is_estimate, REFERENCES
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Deserialize, make_reader, Reader
 from odocal_ros.messages.message_fields import IMU, Pairs
@@ -29,6 +29,7 @@ from odocal_ros.offline.inspection_drive import DriveInspection, inspect_drive
 from odocal_ros.offline.missing_inputs import finding_facts, missing_input_reasons
 from odocal_ros.offline.suggest import likely_mapping, replay_command, replay_refusal
 from odocal_ros.offline.survey import fix_path, FixPath, Match
+from odocal_ros.offline.topic_notes import partial_imus, topic_notes
 from odocal_ros.output.files import plain
 from odocal_ros.output.value_text import counted
 from odocal_ros.reasons import Reason
@@ -70,7 +71,7 @@ class _Selection(NamedTuple):
     """The most likely topics of a bag."""
 
     mapping: dict[str, str]         # slot -> topic
-    not_following: set[str]         # odometers that do not follow the fixes, while another does
+    unusual: dict[str, Any]         # of the content: unsuitable and undefined topics, notes
     topics: list[dict[str, Any]]    # facts of all topics
     initial_config: Config          # the settings given, with those by the names of topics
     options: list[str]              # settings that the odometer needs
@@ -83,7 +84,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     Times are seconds from the bag's first message, angles rad, the rest SI.
     """
     samples_by_topic, errors = _make_samples(bag, config, overrides)
-    mapping, not_following, topics, initial_config, options = _select_topics(
+    mapping, unusual, topics, initial_config, options = _select_topics(
         bag, samples_by_topic, errors, config, overrides)
     config = with_settings(initial_config, dict(map(parse_set, options)))
     if options:
@@ -92,17 +93,16 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     if {'imu', 'odometer'} <= mapping.keys():
         drive = inspect_drive(bag, _combined_recorder(samples_by_topic, mapping), config)
     options += drive.options
-    content = {**_bag_facts(bag, path), 'topics': topics, 'mapping': mapping,
-               'not_following': sorted(not_following), **drive.content}
+    content = {**_bag_facts(bag, path), 'topics': topics, 'mapping': mapping, **unusual,
+               **drive.content}
     if 'fix' in mapping:
         config = settings_by_frame(samples_by_topic[mapping['fix']].recorder.rows('fix'), config)
     findings = [*(note for note in bag.notes if isinstance(note, Reason)), *drive.findings,
                 *missing_input_reasons(content, mapping, config)]
     return dict(plain(content | {
         'findings': finding_facts(findings, config, options),
-        'replay_error': replay_refusal(bag.topics, initial_config, overrides),
-        'command': replay_command(path, bag.topics, initial_config, overrides, mapping,
-                                  options)}))
+        'replay_error': replay_refusal(bag.topics, initial_config, overrides), 'command':
+        replay_command(path, bag.topics, initial_config, overrides, mapping, options)}))
 
 
 def _select_topics(bag: Bag, samples_by_topic: dict[str, _TopicSamples], errors: dict[str, str],
@@ -112,7 +112,11 @@ def _select_topics(bag: Bag, samples_by_topic: dict[str, _TopicSamples], errors:
     # these readers store samples and return none, so that the second argument is not called
     bag.read({**samples_by_topic, **collectors, **_static_readers(samples_by_topic, bag)}, print)
     # first by names and types only; again after the comparison with the fixes
-    mapping, config = likely_mapping(bag.topics, config, overrides)
+    quantities = {name: survey.measured_quantities(topic_samples.recorder.rows('imu'))
+                  for name, topic_samples in samples_by_topic.items()
+                  if topic_samples.reader.slot == 'imu'}
+    partial = partial_imus(quantities)
+    mapping, config = likely_mapping(bag.topics, config, overrides, partial)
     imu, fix = (samples_by_topic.get(mapping.get(slot, '')) for slot in ('imu', 'fix'))
     turn_rate = survey.turn_rate_to_left(imu.recorder.rows('imu')) if imu else None
     fixes = fix_path(fix.recorder.rows('fix'), config.gnss) if fix else None
@@ -120,14 +124,14 @@ def _select_topics(bag: Bag, samples_by_topic: dict[str, _TopicSamples], errors:
                for name, topic_samples in samples_by_topic.items() if topic_samples.lists}
     matches = _matches(bag, samples_by_topic, motions, fixes, config) if fixes else {}
     not_following = odometer_search.topics_not_following(matches)
-    mapping, config = likely_mapping(bag.topics, config, overrides, not_following)
+    mapping, config = likely_mapping(bag.topics, config, overrides, not_following | partial)
     fields = {name: collector.facts(fixes) for name, collector in collectors.items()
               if fixes and not collector.error}
     odometer_search.drop_weak_fields(fields.values())
     # an odometer of another type is suggested if no topic with a reader is one
     needs_field = mapping.get('odometer') not in samples_by_topic or (
-        'odometer' not in overrides and matches and not any(
-            match.follows for match in matches.values()))
+        'odometer' not in overrides and (is_estimate(mapping['odometer']) or (
+            matches and not any(match.follows for match in matches.values()))))
     field_topic = odometer_search.best_topic(
         fields, overrides.get('odometer', '')) if needs_field else ''
     if field_topic:
@@ -144,8 +148,13 @@ def _select_topics(bag: Bag, samples_by_topic: dict[str, _TopicSamples], errors:
             facts['odometer']['not_following'] = name in not_following
         facts |= {'fields': fields[name]} if name in fields else {}
         if name in motions and not field_topic:
-            facts |= _list_facts(samples_by_topic[name].reader, motions[name])
-    return _Selection(mapping, not_following, topics, config, options)
+            facts |= wheel_survey.list_facts(samples_by_topic[name].reader, motions[name])
+    undefined = {name: bag.topics[name].msgtype for name, collector in collectors.items()
+                 if collector.is_undefined}
+    return _Selection(mapping, {
+        'not_following': sorted(not_following), 'partial_imus': sorted(partial),
+        'undefined': undefined, 'topic_notes': topic_notes(
+            mapping, overrides, quantities, undefined)}, topics, config, options)
 
 
 def _bag_facts(bag: Bag, path: str) -> dict[str, Any]:
@@ -239,14 +248,6 @@ def _matches(bag: Bag, samples_by_topic: dict[str, _TopicSamples],
                 topic_samples.form_by_fixes = other if other is not form else None
             matches[name] = odometer_search.match_of(rows, topic_samples.form or form, fixes)
     return matches
-
-
-def _list_facts(reader: Reader, values: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the facts of a topic with lists, from the motion of its values."""
-    form = reader.form
-    return {'values': values,
-            **({'motions': wheel_survey.motion_texts(values)} if len(values) > 1 else {}),
-            **({'chosen': form.selection_text} if form and form.selection_text else {})}
 
 
 def _wheel_options(samples_by_topic: dict[str, _TopicSamples], mapping: dict[str, str],

@@ -29,7 +29,8 @@ def _head(content: dict[str, Any]) -> list[str]:
     lines = [one_line(content['path']),
              f'  {content["duration"]:.1f} s from {content["start_utc"]}, {content["messages"]} '
              f'messages in {counted(len(content["files"]), "file")}']
-    return lines + [line for note in content['notes'] for line in wrapped(f'note: {note}')]
+    return lines + [line for note in (*content['notes'], *content['topic_notes'])
+                    for line in wrapped(f'note: {note}')]
 
 
 def _topics(content: dict[str, Any], roles: dict[str, str]) -> list[str]:

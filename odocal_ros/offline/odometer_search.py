@@ -22,7 +22,7 @@ from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
-from odocal_ros.errors import BadData, OdocalError
+from odocal_ros.errors import BadData, OdocalError, UndefinedType
 from odocal_ros.library.topics import COMMANDS, GNSS, SYSTEM_TOPICS, without_estimates
 from odocal_ros.messages.decode import Deserialize
 from odocal_ros.messages.message_fields import IMU, MessageView, Pairs
@@ -51,7 +51,7 @@ class FieldCollector:
     unreadable = 0       # an unreadable topic is no error
 
     def __init__(self, count: int) -> None:
-        self.count, self.error = count, ''
+        self.count, self.error, self.is_undefined = count, '', False
         self.paths: list[str] = []
         self.is_integer: list[bool] = []
         self._stride, self._message_count, self._times, self._values = 1, 0, array('q'), array('d')
@@ -75,7 +75,7 @@ class FieldCollector:
                 self._find_fields(view.message)
             values = [float(view.value(path)) for path in self.paths]
         except OdocalError as error:
-            self.error = str(error)
+            self.error, self.is_undefined = str(error), isinstance(error, UndefinedType)
         except MemoryError:
             raise
         except Exception:    # a damaged message, or one with a shorter list

@@ -21,23 +21,24 @@ OTHER_DEVICE_WORDS = ('zed', 'camera', 'lidar', 'livox', 'ouster')
 
 
 def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
-                   not_following: Collection[str] = ()) -> tuple[dict[str, str], Config]:
+                   unsuitable: Collection[str] = ()) -> tuple[dict[str, str], Config]:
     """
     Return slot -> most likely topic, and the settings that this mapping needs.
 
-    not_following : odometer topics that do not follow the path of the fixes, while another does.
+    unsuitable : odometer topics that do not follow the path of the fixes, while another does, and
+    IMU topics without the turn rates or accelerations that another has.
     """
     mapping = {slot: resolve_topic(topics, slot, topic) for slot, topic in overrides.items()}
     if not config.odometer.wheel_keys and not {'odometer', 'odometer_right'} & mapping.keys() and (
             pair := _left_right_pair(topics, [
                 topic for topic in candidates(topics, 'odometer', config, mapping)
-                if topic not in not_following])):
+                if topic not in unsuitable])):
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
         mapping['odometer'], mapping['odometer_right'] = pair
     for slot in required_slots(config):
         fitting = [] if slot in mapping else candidates(topics, slot, config, mapping)
         if fitting:
-            mapping[slot] = _sorted_topics(topics, slot, fitting, not_following)[0]
+            mapping[slot] = _sorted_topics(topics, slot, fitting, unsuitable)[0]
     return mapping, config
 
 
@@ -49,36 +50,38 @@ def _left_right_pair(topics: dict[str, TopicInfo], names: list[str]) -> tuple[st
     return pairs[0] if len(pairs) == 1 else None
 
 
-def _sort_keys(slot: str, info: TopicInfo, not_following: Collection[str]) -> dict[str, int | str]:
+def _sort_keys(slot: str, info: TopicInfo, unsuitable: Collection[str]) -> dict[str, int | str]:
     """Return reason -> sort key of a topic, the most important first; the smallest is best."""
     usual_name = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     name, kind = info.name.lower(), 0
+    needed = ('it grows with the distance between the fixes' if 'odometer' in slot
+              else 'it has turn rates')
     fits = int('rtk' in name if slot == 'fix'
                else not any(word in name for word in OTHER_DEVICE_WORDS))
     if 'odometer' in slot:
         fits = 2 * any(word in name for word in WHEEL_WORDS) or 'odom' in name
         kind = next(i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype)
-    return {'it grows with the distance between the fixes': info.name in not_following,
+    return {needed: info.name in unsuitable,
             'counts are preferred to joint angles, and angles to speeds': kind,
             'it has the usual name': not info.name.endswith(usual_name), 'its name fits': -fits,
             'it has the most messages': -info.count, 'it is the first by name': info.name}
 
 
 def _sorted_topics(topics: dict[str, TopicInfo], slot: str, names: Iterable[str],
-                  not_following: Collection[str]) -> list[str]:
+                  unsuitable: Collection[str]) -> list[str]:
     """Return topics that fit a slot, the most likely first."""
     return sorted(names, key=lambda name: tuple(
-        _sort_keys(slot, topics[name], not_following).values()))
+        _sort_keys(slot, topics[name], unsuitable).values()))
 
 
 def other_candidates(topics: dict[str, TopicInfo], slot: str, config: Config,
                      mapping: dict[str, str],
-                     not_following: Collection[str]) -> tuple[list[str], str]:
+                     unsuitable: Collection[str]) -> tuple[list[str], str]:
     """Return the other candidates for a slot, the most likely first, and why it has its topic."""
     used_topics = {other: topic for other, topic in mapping.items() if other != slot}
     others = _sorted_topics(topics, slot, set(candidates(topics, slot, config, used_topics)) - {
-        mapping[slot]}, not_following)
-    keys, *other_keys = (_sort_keys(slot, topics[name], not_following)
+        mapping[slot]}, unsuitable)
+    keys, *other_keys = (_sort_keys(slot, topics[name], unsuitable)
                          for name in (mapping[slot], *others[:1]))
     return others, next((reason for reason, key in keys.items()
                          if other_keys and key != other_keys[0][reason]), '')

@@ -116,6 +116,11 @@ def imu_facts(samples: ImuSamples) -> dict[str, Any]:
         'yaw_sigma': float(np.sqrt(np.median(known_variance))) if len(known_variance) else None}
 
 
+def measured_quantities(samples: ImuSamples) -> tuple[bool, bool]:
+    """Return two flags of an IMU topic: it has turn rates, it has specific forces."""
+    return bool(np.nan_to_num(samples.w_i).any()), bool(np.nan_to_num(samples.f_i).any())
+
+
 def turn_rate_to_left(samples: ImuSamples) -> tuple[Ints, Floats] | None:
     """Return stamps, ns, and the turn rate about the vertical, rad/s, (n,); None without rows."""
     rows = take(samples, ~(is_impossible('f_i', samples.f_i) | is_impossible('w_i', samples.w_i)))

@@ -107,11 +107,12 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
     """Return the most likely topic of each slot with several candidates."""
     from odocal_ros.library.topics import candidates
     from odocal_ros.offline.suggest import likely_mapping, other_candidates
-    mapping, not_following = content['mapping'], content['not_following']
-    _, config = likely_mapping(bag.topics, config, topics, not_following)
+    mapping = content['mapping']
+    unsuitable = [*content['not_following'], *content['partial_imus']]
+    _, config = likely_mapping(bag.topics, config, topics, unsuitable)
     choices = []
     for slot in mapping.keys() - topics.keys():
-        others, reason = other_candidates(bag.topics, slot, config, mapping, not_following)
+        others, reason = other_candidates(bag.topics, slot, config, mapping, unsuitable)
         if others and mapping[slot] in candidates(bag.topics, slot, config, {}):
             choices.append(_Choice(slot, mapping[slot], others, reason))
     return sorted(choices, key=lambda choice: list(INPUTS).index(choice.slot))
@@ -169,6 +170,8 @@ def _overview(content: dict[str, Any], choices: list[_Choice], options: list[tup
     for slot in sorted(mapping, key=lambda slot: wheels.get(slot, 2)):
         left = 'left ' * (slot == 'odometer' and 'odometer_right' in mapping)
         lines += wrapped(f'{left}{INPUTS[slot].label}: {mapping[slot]}{because.get(slot, "")}')
+    for note in content['topic_notes']:
+        lines += wrapped(f'note: {note}')
     settings = [value for option, value in options if option == '--set']
     lines += ['settings'] * bool(settings)
     for setting in settings:

@@ -11,6 +11,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import MAX_DAYS
+from odocal_ros.messages.decode import Reader
 from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.raws import tables
 from odocal_ros.nav.time_series import running_integral
@@ -158,3 +159,11 @@ def motion_texts(facts: list[dict[str, Any]]) -> list[str]:
         lines.append(f'{value["key"]} travels {value["distance"]:.5g} {unit} in total, range '
                      f'{value["span"]:.5g} {unit}: {kind}')
     return lines
+
+
+def list_facts(reader: Reader, values: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the facts of a topic with lists, from the motion of its values."""
+    form = reader.form
+    return {'values': values,
+            **({'motions': motion_texts(values)} if len(values) > 1 else {}),
+            **({'chosen': form.selection_text} if form and form.selection_text else {})}

@@ -3,8 +3,10 @@
 
 """Axes of the gyro compared with gravity and the course of the fixes."""
 
+import ast
 from dataclasses import replace
 from functools import cache
+import re
 from types import SimpleNamespace
 
 from drives import changed, drive, reason_texts, rejecting, settings
@@ -97,6 +99,23 @@ def test_chance_of_a_coefficient_follows_the_f_distribution(segments, found, nea
     fit = GravityFit(np.array([found]), np.array([0.1]), np.array([segments]))
     assert fit.chance(0, 1.0) == pytest.approx(
         f_distribution.sf(abs(found - nearest)**2 / 0.1**2, 2, 2 * (segments - 1)), rel=1e-9)
+
+
+@pytest.mark.parametrize('rpy', [(np.pi / 2, 0, 0), (-np.pi / 2, 0, 0), (0, np.pi / 2, 0),
+                                 (-np.pi / 2, -np.pi / 2, 0), (-np.pi / 2, 0, -np.pi / 2)])
+def test_a_gyro_on_its_side_without_accelerometer_gets_its_mounting(rpy):
+    """The last one is an optical frame: x right, y down, z forward."""
+    no_force = {'w_i': lambda w: w @ matrix_from_rpy(rpy),
+                'f_i': lambda f: np.full_like(f, np.nan)}
+    leg = replace(town().leg(), imu=changed(town().imu, **no_force))
+    config = settings(town())
+    found = {r.code: r for r in find_faults(screen_leg(leg, config), config)}
+    remedy = found[Code.GYRO_AXES].special_remedy
+    mounting = ast.literal_eval(re.search(r'to (\[.*\]):', remedy)[1])
+    config = with_settings(config, {'imu.mounting_rpy': tuple(mounting)})
+    assert not {Code.GYRO_AXES, Code.GYRO_SIGN} & {
+        r.code for r in find_faults(screen_leg(leg, config), config)}
+    assert matrix_from_rpy(mounting)[2] == pytest.approx(matrix_from_rpy(rpy)[2], abs=1e-4)
 
 
 @pytest.mark.parametrize(('x', 'y', 'named'), [

@@ -3,15 +3,18 @@
 
 """odocal inspect finds the odometer in messages of any type, by the path of the fixes."""
 
+from contextlib import closing
 from functools import cache
 import json
 import shlex
+import sqlite3
 
 from drives import changed, drive
 import numpy as np
 import pytest
 import ros_bags
 import ros_messages as make
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
@@ -239,6 +242,64 @@ def test_a_component_of_a_velocity_is_not_called_speed(tmp_path, capsys):
     block = text.partition('\n/vel\n')[2].partition('\n\n')[0]
     assert block.strip().startswith('one component of a velocity')
     assert found['not_following'] == ['/vel']
+
+
+def without_definitions(path, store):
+    """Return a bag with the content of another, as an sqlite3 bag without definitions."""
+    with AnyReader([path], default_typestore=store) as reader:
+        rows = [(c.topic, c.msgtype, t, raw) for c, t, raw in reader.messages()]
+    out = ros_bags.write(path.parent / 'foxy', [(topic, t, raw) for topic, _, t, raw in rows],
+                         'sqlite3', types={topic: kind for topic, kind, *_ in rows}, store=store)
+    with closing(sqlite3.connect(out / 'foxy.db3')) as db, db:
+        db.execute('DELETE FROM message_definitions')
+    return out
+
+
+def estimates(made):
+    """Return velocities by a filter, at the time of each odometer message."""
+    speed = np.gradient(made.odometer.value * made.truth.scale, made.odometer.stamp_ns * 1e-9)
+    return [('/odometry/filtered', t, make.odometry(t, v)) for t, v in zip(
+        made.odometer.stamp_ns.tolist(), speed, strict=True)]
+
+
+def test_a_field_is_preferred_to_an_estimate_that_follows_the_fixes(tmp_path, capsys):
+    made = town()
+    path = write(tmp_path / 'bag', made, encoders(made, ('speed_kmh',)) + estimates(made))
+    found, text = inspected(path, capsys)
+    assert found['mapping']['odometer'] == '/encoders'
+    assert 'an estimate by its name' not in text
+    # without its definition only the estimate is left
+    found, text = inspected(without_definitions(path, types()), capsys)
+    assert found['mapping']['odometer'] == '/odometry/filtered'
+    text = ' '.join(text.split())
+    assert 'note: /odometry/filtered is an estimate by its name' in text
+    assert 'does not define their types: /encoders (mycar_msgs/msg/Encoders). If one' in text
+    assert 'an estimate by its name' not in inspected(
+        path, capsys, '--odometer-topic', '/odometry/filtered')[1]
+
+
+def test_a_missing_odometer_names_topics_of_undefined_types(tmp_path, capsys):
+    made = town()
+    path = without_definitions(write(tmp_path / 'bag', made, encoders(made, ('ticks',))), types())
+    _, text = inspected(path, capsys)
+    text = ' '.join(text.split())
+    assert 'no topic for the odometer; not searched for an odometer, because the bag does' in text
+    assert '/encoders (mycar_msgs/msg/Encoders). If one of them is the odometer, convert' in text
+
+
+def test_gyro_and_accelerometer_on_two_topics_are_named(tmp_path, capsys):
+    made = drive(scenario='town', duration=200.0, seed=4)
+    gyro = changed(made.imu, f_i=lambda f: 0 * f)
+    accelerometer = changed(made.imu, w_i=lambda w: 0 * w)
+    topics = [fix('/fix', made.fix), counter('/odometer', made.odometer),
+              imu('/camera/gyro', gyro), imu('/camera/accel', accelerometer)]
+    found, text = inspected(write_bag(tmp_path / 'two', topics), capsys)
+    assert found['mapping']['imu'] == '/camera/gyro'      # not the first by name
+    assert 'note: /camera/gyro has only turn rates, /camera/accel only' in ' '.join(text.split())
+    found, text = inspected(write_bag(tmp_path / 'three', [
+        *topics, imu('/camera/imu', made.imu)]), capsys)
+    assert found['mapping']['imu'] == '/camera/imu'
+    assert 'only turn rates' not in text
 
 
 def test_without_odometer_and_imu_standstills_are_not_mentioned(tmp_path, capsys):

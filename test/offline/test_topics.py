@@ -204,6 +204,17 @@ def test_wheels_are_preferred_to_estimates_at_higher_rates(right, wrong):
     assert likely_mapping(found, Config(), {})[0]['odometer'] == next(iter(right))
 
 
+@pytest.mark.parametrize(('raw', 'fused'), [
+    ('/gnss_1/llh_position', '/ekf/llh_position'),
+    ('/fixposition/gnss1', '/fixposition/odometry_llh'),
+    ('/gps/fix', '/gps/filtered'), ('/gnss', '/ins/fix')])
+def test_positions_of_a_receiver_are_preferred_to_those_of_a_filter(raw, fused):
+    found = {n: TopicInfo(n, t, 5) for n, t in BASE.items() if n != '/fix'} | {
+        raw: TopicInfo(raw, FIX, 5), fused: TopicInfo(fused, FIX, 500)}
+    assert choose(found)['fix'] == raw
+    assert choose({n: t for n, t in found.items() if n != raw})['fix'] == fused
+
+
 @pytest.mark.parametrize('names', [('/encoders/left', '/encoders/right'),
                                    ('/left_wheel/rpm', '/right_wheel/rpm')])
 def test_left_and_right_topics_are_chosen_as_a_pair_among_others(names):
