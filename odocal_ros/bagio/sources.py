@@ -114,7 +114,8 @@ def _hint_on_subfolders(path: Path) -> str:
     """Return a hint with the bags one folder below, or an empty text."""
     bags = [folder for folder in sorted(path.iterdir()) if folder.is_dir()
             and any(file.name.endswith(ENDINGS) for file in folder.iterdir())]
-    return f'; did you mean {" or ".join(map(str, bags[:3]))}?' if bags else ''
+    one_drive = ' If they are one drive, put their files into one folder' * (len(bags) > 1)
+    return f'; did you mean {" or ".join(map(str, bags[:3]))}?{one_drive}' if bags else ''
 
 
 def _number_key(path: Path) -> list[tuple[int, str]]:

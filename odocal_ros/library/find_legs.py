@@ -188,17 +188,26 @@ def _no_common_time_text(recorder: LegRecorder) -> str:
             'odometer.arrival_time, gnss.arrival_time)')
 
 
+def zero_of_times(bag: AnyBag, first: int, last: int) -> int:
+    """
+    Return the stamp at which the seconds of a leg begin: the start of the bag.
+
+    If the stamps, from first to last, are on another clock than the bag times, as in simulation
+    time or in a recording of a replay, it is the first of them.
+    """
+    return bag.start_ns if first <= bag.end_ns and bag.start_ns <= last else first
+
+
 def _span_in_bag(span: LegSpan, bag: AnyBag, first: int, last: int) -> tuple[int, int]:
     """Return the stamps of a requested leg; raise BadUsage if it is outside the bag."""
-    start = first if span.start_ns is None else (
-        span.start_ns + bag.start_ns * span.start_is_relative)
-    stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.stop_is_relative
-    # stamps may be on another clock than bag times, as in a recording of a replay
-    begin, end = min(bag.start_ns, first), max(bag.end_ns, last)
+    zero = zero_of_times(bag, first, last)
+    start = first if span.start_ns is None else span.start_ns + zero * span.start_is_relative
+    stop = last if span.stop_ns is None else span.stop_ns + zero * span.stop_is_relative
+    begin, end = min(zero, first), max(zero + bag.end_ns - bag.start_ns, last)
     if (stop <= start or stop < begin - BAG_TIME_TOLERANCE_NS
             or start > end + BAG_TIME_TOLERANCE_NS):
         length = (bag.end_ns - bag.start_ns) * 1e-9
-        requested = ':'.join(f'{(stamp - bag.start_ns) * 1e-9:.2f}' for stamp in (start, stop))
+        requested = ':'.join(f'{(stamp - zero) * 1e-9:.2f}' for stamp in (start, stop))
         raise BadUsage(f'{bag.name}: the leg {requested} contains no data; the bag runs '
                        f'from 0 to {length:.1f} s; correct --leg')
     return start, stop

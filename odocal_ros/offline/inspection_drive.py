@@ -23,7 +23,12 @@ from odocal_ros.data.arrays import Floats, lengths, medians
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.arguments import EACH_STOP, LegSpan
-from odocal_ros.library.find_legs import find_legs, marked_legs, standstills_of
+from odocal_ros.library.find_legs import (
+    find_legs,
+    marked_legs,
+    standstills_of,
+    zero_of_times,
+)
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
@@ -104,10 +109,11 @@ def inspect_drive(bag: Bag, recorder: LegRecorder, config: Config) -> DriveInspe
     if mounting['needed'] and not axis_faults:
         rpy = ', '.join(f'{angle:.10g}' for angle in mounting['rpy'])
         result.options.append(f'imu.mounting_rpy=[{rpy}]')
-    legs, leg_options = _describe_legs(bag, recorder, inputs, located, standstills, first_ns,
-                                       config)
+    # s: times of a leg start at its first sample
+    offset = (first_ns - zero_of_times(bag, first_ns, last_ns)) * 1e-9
+    legs, leg_options = _describe_legs(bag, recorder, inputs, located, standstills, offset,
+                                       first_ns, config)
     result.options += [*_sigma_limit(recorder, config), *leg_options]
-    offset = (first_ns - bag.start_ns) * 1e-9      # s: times of a leg start at its first sample
     result.content |= {'drive': drive, 'mounting': mounting, **legs, 'standstills': [
         [offset + begin, offset + end] for begin, end in standstills.tolist()]}
     return result
@@ -190,16 +196,15 @@ def _check_gyro(inputs: Inputs, located: LocatedFixes, w_i: Floats,
 
 
 def _describe_legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, located: LocatedFixes,
-                   standstills: Floats, first_ns: int,
+                   standstills: Floats, offset: float, first_ns: int,
                    config: Config) -> tuple[dict[str, Any], list[str]]:
     """
     Return the legs that replay would use and other possible ones, and options for better ones.
 
-    standstills : (k, 2) s.   first_ns : stamp of t = 0.
+    standstills : (k, 2) s.   offset : added to times, s.   first_ns : stamp of t = 0.
     """
     if not len(inputs.t_fix):
         return {}, []
-    offset = (first_ns - bag.start_ns) * 1e-9
 
     def leg_facts(start_ns: int, stop_ns: int) -> dict[str, Any]:
         start, stop = (start_ns - first_ns) * 1e-9, (stop_ns - first_ns) * 1e-9

@@ -9,7 +9,7 @@ from typing import Any
 from odocal_ros.calib.drive import speed_reason
 from odocal_ros.library.topics import NO_MESSAGES_REMEDY, topics_without_messages
 from odocal_ros.offline.inspection_drive import is_closed
-from odocal_ros.offline.topic_notes import CONVERT, undefined_text
+from odocal_ros.offline.topic_notes import missing_odometer_texts
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
@@ -60,13 +60,10 @@ def _topic_reasons(content: dict[str, Any], mapping: dict[str, str],
         if not facts and (slot != 'imu' or config.odometer.needs_imu):
             empty = topics_without_messages(
                 {name: (topic['type'], topic['count']) for name, topic in topics.items()}, slot)
-            undefined = content['undefined'] if slot == 'odometer' else {}
-            text = f'no topic for the {label}' + (
-                f'; {undefined_text(undefined)}' if undefined else '')
-            remedy = f'If one of them is the odometer, {CONVERT}. ' * bool(undefined) + remedy
+            cause, action = missing_odometer_texts(content) if slot == 'odometer' else ('', '')
             reasons.append(Reason(
                 code, f'{", ".join(empty)} has no messages', NO_MESSAGES_REMEDY) if empty else
-                Reason(code, text, remedy))
+                Reason(code, f'no topic for the {label}{cause}', action + remedy))
         elif 'error' in facts and 'timing' not in facts:
             reasons.append(Reason(
                 code, f'{facts["name"]}: no message can be used: {facts["error"]}',

@@ -29,6 +29,7 @@ from odocal_ros.messages.message_fields import IMU, MessageView, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.nav.odometer import make_travel
 from odocal_ros.offline.survey import FixPath, Match
+from odocal_ros.offline.topic_notes import RAW_CAN
 from odocal_ros.offline.wheel_survey import find_sides, wheel_settings
 
 # judgement: limits of the search in one topic; 0.4 million values take 1 s and 4 MB
@@ -41,8 +42,9 @@ INCREMENT_WORDS = ('delta', 'diff', 'increment', 'since')
 ROLLOVERS = (2**8, 2**16, 2**32)      # format: of counters of 8, 16 and 32 bits
 MAX_TOPICS = 20       # judgement: topics of unknown types that are searched
 RECEIVER_WORDS = (*GNSS, 'navsat', 'nmea', 'ubx')      # topics of GNSS receivers
-STANDARD_PACKAGES = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs',
-                     'diagnostic_msgs')
+# types without an odometer: their fields have fixed meanings, or those of several raw CAN frames
+OTHER_PACKAGES = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs',
+                  'diagnostic_msgs', RAW_CAN.partition('/')[0])
 
 
 class FieldCollector:
@@ -210,7 +212,7 @@ def _may_be_odometer(info: TopicInfo) -> bool:
     """Return True for types without a fixed meaning, except GNSS and commands."""
     package = info.msgtype.partition('/')[0]
     return (info.msgtype not in (*ODOMETERS, IMU) and info.name not in SYSTEM_TOPICS
-            and package not in STANDARD_PACKAGES and '/calibrator/' not in info.name
+            and package not in OTHER_PACKAGES and '/calibrator/' not in info.name
             and not any(word.startswith((*RECEIVER_WORDS, *COMMANDS))
                         for word in re.split(r'[/_]', f'{info.name}/{info.msgtype}'.lower())))
 

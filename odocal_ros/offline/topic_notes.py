@@ -5,12 +5,14 @@
 
 from collections.abc import Collection, Mapping
 from itertools import product
+from typing import Any
 
 from odocal_ros.library.topics import is_estimate
 
 MAX_NAMES = 6      # judgement: topics in a note
 CONVERT = ("convert the bag to mcap with 'ros2 bag convert' where these packages are installed "
            '(docs/from_a_bag.md)')
+RAW_CAN = 'can_msgs/msg/Frame'
 Quantities = Mapping[str, tuple[bool, bool]]     # IMU topic -> has turn rates, has specific forces
 
 
@@ -51,3 +53,18 @@ def undefined_text(undefined: Mapping[str, str]) -> str:
     more = f' and {len(names) - MAX_NAMES} more' * (len(names) > MAX_NAMES)
     return ('not searched for an odometer, because the bag does not define their types: '
             + ', '.join(names[:MAX_NAMES]) + more)
+
+
+def missing_odometer_texts(content: Mapping[str, Any]) -> tuple[str, str]:
+    """Return what a bag has in place of an odometer topic, and the action; '' if nothing."""
+    undefined = content['undefined']
+    frames = [topic['name'] for topic in content['topics'] if topic['type'] == RAW_CAN]
+    cause, action = '', ''
+    if undefined:
+        cause += f'; {undefined_text(undefined)}'
+        action += f'If one of them is the odometer, {CONVERT}. '
+    if frames:
+        cause += f'; {", ".join(frames)}: raw CAN frames'
+        action += ('Decode the wheel speeds of the CAN frames into a topic, with the DBC file of '
+                   'the vehicle. ')
+    return cause, action

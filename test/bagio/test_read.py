@@ -227,6 +227,11 @@ def test_wrong_topics_and_paths_are_refused_with_the_cause(tmp_path, plain, monk
             bag.read({'/x': make_reader('imu', 'sensor_msgs/msg/Imu', Config())}, print)
     with pytest.raises(BadBag, match=f'did you mean {plain}'), open_bag(plain.parent):
         pass
+    for name in ('gps', 'imu'):
+        shutil.copytree(plain, tmp_path / 'sensors' / name)
+    with pytest.raises(BadBag, match=r'/gps or .*/imu\? If they are one drive, put their files'), \
+            open_bag(tmp_path / 'sensors'):
+        pass
     (tmp_path / 'a').mkdir()
     with pytest.raises(BadBag, match='holds no .mcap, .db3 or .bag file$'), open_bag(tmp_path):
         pass

@@ -38,7 +38,8 @@ def types():
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in (('mycar_msgs/msg/Motor', MOTOR), ('mycar_msgs/msg/Encoders', ENCODERS),
                        ('autoware_vehicle_msgs/msg/VelocityReport', VELOCITY),
-                       ('autoware_vehicle_msgs/msg/SteeringReport', STEERING)):
+                       ('autoware_vehicle_msgs/msg/SteeringReport', STEERING),
+                       ('can_msgs/msg/Frame', 'uint32 id\nuint8[2] data\n')):
         store.register(get_types_from_msg(text, name))
     return store
 
@@ -285,6 +286,20 @@ def test_a_missing_odometer_names_topics_of_undefined_types(tmp_path, capsys):
     text = ' '.join(text.split())
     assert 'no topic for the odometer; not searched for an odometer, because the bag does' in text
     assert '/encoders (mycar_msgs/msg/Encoders). If one of them is the odometer, convert' in text
+
+
+def test_raw_can_frames_are_not_searched(tmp_path, capsys):
+    """Frames of several senders share one topic: a byte of it is no odometer."""
+    made = town()
+    frame = types().types['can_msgs/msg/Frame']
+    counts = made.odometer.value.astype(np.int64) // 8
+    path = write(tmp_path / 'bag', made, [
+        ('/can', t, frame(id=0x1a0, data=np.array([count // 256, count % 256], np.uint8)))
+        for t, count in zip(made.odometer.stamp_ns.tolist(), counts.tolist(), strict=True)])
+    found, text = inspected(path, capsys)
+    assert 'odometer' not in found['mapping']
+    text = ' '.join(text.split())
+    assert 'no topic for the odometer; /can: raw CAN frames. Decode the wheel speeds' in text
 
 
 def test_gyro_and_accelerometer_on_two_topics_are_named(tmp_path, capsys):

@@ -114,6 +114,18 @@ def inspect_drive(tmp_path, capsys):
     return inspected
 
 
+def test_times_are_those_of_the_stamps_if_they_are_on_another_clock(tmp_path, capsys):
+    """In simulation time, seconds from the first message of the bag would be negative."""
+    rows = drive(lambda ns, _, left, right: make.joints(ns, ['left', 'right'], [left, right]))
+    (usual, _), (other, _) = (inspect(ros_bags.write(tmp_path / name, [
+        (topic, ns + later, message) for topic, ns, message in rows]), capsys)
+        for name, later in (('bag', 0), ('other', 10**16)))
+    # the last topic begins 0.4 s after the first message
+    assert other['standstills'] == [pytest.approx(span, abs=0.5) for span in usual['standstills']]
+    assert [leg['start'] for leg in other['legs']] == [
+        pytest.approx(leg['start'], abs=0.5) for leg in usual['legs']]
+
+
 def test_the_sides_of_unnamed_joints_are_found_from_their_motion(inspect_drive):
     names = ['j1', 'j2', 'j3']
     printed, wheels, text = inspect_drive(lambda ns, i, left, right: make.joints(

@@ -117,6 +117,19 @@ def test_standstills_give_one_leg_or_several_if_requested(out_and_back):
         assert not moving(out_and_back, edge - S)
 
 
+def test_seconds_of_a_leg_begin_at_the_first_stamp_of_another_clock(out_and_back):
+    """As in simulation time, or when the recording of a replay is recorded."""
+    recorder, bag = recorded(out_and_back)
+    span = LegSpan(20 * S, 70 * S, True, True)
+    on_bag_clock = find_legs.find_legs(recorder, bag, [span], [], Config())
+    bag.start_ns, bag.end_ns = (t + 10**16 for t in (bag.start_ns, bag.end_ns))
+    (start, stop), = find_legs.find_legs(recorder, bag, [span], [], Config())
+    assert stop - start == 50 * S
+    assert abs(start - on_bag_clock[0][0]) < 2 * S      # the fixes begin later
+    with pytest.raises(BadUsage, match='the leg 9000.00:9001.00 contains no data; the bag runs'):
+        find_legs.find_legs(recorder, bag, [LegSpan(9000 * S, 9001 * S, True, True)], [], Config())
+
+
 def test_stamps_without_common_time_are_refused(out_and_back):
     recorder, bag = recorded(out_and_back)
     late = LegRecorder()
