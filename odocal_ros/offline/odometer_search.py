@@ -29,7 +29,6 @@ from odocal_ros.messages.message_fields import IMU, MessageView, Pairs
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.nav.odometer import make_travel
 from odocal_ros.offline.survey import FixPath, Match
-from odocal_ros.offline.topic_notes import RAW_CAN
 from odocal_ros.offline.wheel_survey import find_sides, wheel_settings
 
 # judgement: limits of the search in one topic; 0.4 million values take 1 s and 4 MB
@@ -44,7 +43,7 @@ MAX_TOPICS = 20       # judgement: topics of unknown types that are searched
 RECEIVER_WORDS = (*GNSS, 'navsat', 'nmea', 'ubx')      # topics of GNSS receivers
 # types without an odometer: their fields have fixed meanings, or those of several raw CAN frames
 OTHER_PACKAGES = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs',
-                  'diagnostic_msgs', RAW_CAN.partition('/')[0])
+                  'diagnostic_msgs', 'can_msgs')
 
 
 class FieldCollector:

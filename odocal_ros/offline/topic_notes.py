@@ -56,7 +56,7 @@ def undefined_text(undefined: Mapping[str, str]) -> str:
 
 
 def missing_odometer_texts(content: Mapping[str, Any]) -> tuple[str, str]:
-    """Return what a bag has in place of an odometer topic, and the action; '' if nothing."""
+    """Return the text on unreadable topics of a bag without odometer, and the action, or ''."""
     undefined = content['undefined']
     frames = [topic['name'] for topic in content['topics'] if topic['type'] == RAW_CAN]
     cause, action = '', ''
