@@ -108,7 +108,6 @@ def without(leg, slot, begin=-np.inf, end=np.inf):
 
 
 def with_increments(leg):
-    """Return a leg whose odometer sends increments of its counts."""
     step = np.diff(leg.odometer.value, prepend=leg.odometer.value[:1])
     return replace(leg, odometer=replace(leg.odometer, value=step),
                    form=OdometerForm('increment', 0, 'm/pulse'))

@@ -44,7 +44,6 @@ def curves() -> list[str]:
 
 
 def status_keys() -> set[str]:
-    """Return the keys of ``~/status`` that any layout shows."""
     found = {m.group(1) for m in map(KEY.search, foxglove_paths()) if m}
     return found | {name.rpartition('/')[2] for name in curves() if name.startswith(STATUS)}
 

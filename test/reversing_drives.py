@@ -35,7 +35,6 @@ def three_point_turn(duration, rng):
 
 
 def made(route, **choices):
-    """Return the simulated drive of a route."""
     name = 'by_hand'
     routes.ROUTES[name] = route
     options.DEFAULTS[name] = {'duration': 300.0, 'imu_grade': 'industrial'}

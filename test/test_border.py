@@ -69,7 +69,6 @@ def _imports(path):
 
 
 def _imported_packages(path):
-    """Return the packages of odocal_ros that a module imports."""
     names = (name.split('.') for name in _imports(path))
     return {name[1] for name in names if name[0] == 'odocal_ros' and len(name) > 1
             and not name[1].startswith('_')}

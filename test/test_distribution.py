@@ -27,7 +27,6 @@ XML = ElementTree.parse(ROOT / 'package.xml').getroot()
 
 
 def repository_files():
-    """Return the names of the files in git."""
     listed = subprocess.run(['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
         pytest.skip('NO GIT REPOSITORY HERE: nothing to compare the sdist with')

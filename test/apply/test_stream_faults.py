@@ -197,7 +197,6 @@ def test_an_impossible_turn_is_reported_and_increases_the_yaw_sigma():
 
 
 def usable(arrivals, stamp_ns, received_ns):
-    """Return a mask of the usable rows."""
     rows = list(zip(stamp_ns.tolist(), received_ns.tolist(), range(len(stamp_ns)), strict=True))
     return np.isin(np.arange(len(rows)), [row for *_, row in arrivals.select_usable(rows)])
 

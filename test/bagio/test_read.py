@@ -38,7 +38,6 @@ SPLIT, TALKER = {'AAA': 804, 'HHH': 726}, {'/topic': 10, '/rosout': 10, '/parame
     ('autoware_kinematic_state_no_metadata.db3', 1, 2130,
      {'/localization/kinematic_state': 2130})])
 def test_bags_of_rosbag2_are_read(data_dir, name, files, messages, topics):
-    """The bags were written by rosbag2."""
     with open_bag(data_dir / 'reader_bags' / name) as bag:
         assert len(bag.files) == files
         assert messages in (None, sum(topic.count for topic in bag.topics.values()))
@@ -204,7 +203,6 @@ def test_memory_stays_bounded_if_the_bag_has_camera_images(tmp_path):
         tracemalloc.stop()
         # a chunk of 1 MiB and its copies, imports and 240 rows; the pictures are 60 MB
         assert peak < 20e6
-
 
 
 def test_a_topic_with_two_types_is_read_as_the_more_frequent_one(tmp_path):

@@ -57,7 +57,6 @@ def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
 
 
 def equations_at(problem, fit, constants):
-    """Return the equations of a fit at other values of the constants."""
     return Equations(problem, replace(fit.state, constants=constants), fit.priors,
                      fit.variance_factors, True)
 

@@ -260,8 +260,7 @@ def test_marginal_information_with_level_errors_has_the_sum_of_both_covariances(
     A, effects = rng.standard_normal((9, 4)), 0.1 * rng.standard_normal((4, 2))
     D, sigma, centre = A.T @ A, np.array([1.0, 2.0, 3.0, np.inf]), rng.standard_normal(4)
     marginal = MarginalInformation(tuple('abcd'), np.zeros(4), D, A.T @ rng.standard_normal(9),
-                                   centre, sigma,
-                                   sigma)
+                                   centre, sigma, sigma)
     wider, weight = marginal.with_errors(effects), 1 / sigma**2
 
     def posterior(one):

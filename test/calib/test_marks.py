@@ -129,7 +129,6 @@ def test_mark_in_motion_is_fitted_with_the_motion_removed():
 
 
 def at_rest(mark, span, t, p, correlation_time=np.nan):
-    """Return the mark from fixes of a vehicle at rest."""
     return fix_at(mark, span, (t, p, np.tile(STATED, (len(t), 1, 1))),
                   lambda times: np.zeros((len(times), 3)), correlation_time, 2.0)
 

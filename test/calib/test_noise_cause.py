@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import RAW_SCALE
+from odocal_ros.estimator.factors.factor import ACCEL_NOISE, VARIANCE_FACTOR_COUNT
+from odocal_ros.estimator.result import mismatch
 from odocal_ros.estimator.result.mismatch import find_noise_cause, find_quantisation_steps
 from odocal_ros.estimator.result.odometry_output import twist_noise
 from odocal_ros.estimator.several import _disagreement_reasons
@@ -94,6 +96,14 @@ def test_quantised_sensor_is_named_beside_another_cause():
     assert 'quantisation: the accelerometer has steps of 0.125 m/s^2' in text
     assert 'gyro noise does not come from vibration' in text
     assert find_noise_cause(one, {'gyro': 1e-2, 'accel': white}, []) == ''
+
+
+@pytest.mark.parametrize(('seconds', 'reported'), [(1, False), (2, False), (3, True)])
+def test_shock_in_a_short_drive_is_not_vibration(seconds, reported):
+    spread = np.ones((60, VARIANCE_FACTOR_COUNT))
+    spread[:seconds, ACCEL_NOISE] = 100.0
+    fit = SimpleNamespace(variance_factors=spread, levels={'accel': 0.005**2})
+    assert bool(mismatch._accelerometer_outlier_reasons(fit)) == reported
 
 
 @pytest.mark.parametrize(('name', 'tyres'), [('odometer_delay', False), ('scale_factor', True)])

@@ -23,6 +23,7 @@ from odocal_ros.estimator.prepare import make_problem
 from odocal_ros.estimator.result.estimates import (
     estimate_constants,
     FittedConstants,
+    join_names,
     OTHER_WARNINGS,
 )
 from odocal_ros.estimator.result.outcome import make_result
@@ -243,3 +244,10 @@ def test_turn_on_bias_of_imus_as_sold_is_not_a_worse_grade(times, is_reported):
     method = smooth(leg_of(replace(drive.leg(), imu=turning), config), config)
     assert (Code.IMU_WORSE_THAN_GRADE in reason_texts(method)) == is_reported
     assert off(method, drive, *BOTH) < 3.3
+
+
+def test_parameter_names_in_reasons_are_words():
+    arm = [f'antenna_lever_arm_{axis}' for axis in 'xyz']
+    assert join_names(arm) == 'the antenna lever arm'
+    assert join_names(['odometer_lever_arm_z', 'gnss_delay', *arm]) == (
+        'the odometer lever arm (up), the fix delay and the antenna lever arm')

@@ -4,7 +4,6 @@
 """Wheel slip, by two_point and in the smoother: its reason, place and uncertainty."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 from drives import drive, off, settings
 import numpy as np
@@ -14,10 +13,7 @@ from smoother_legs import leg_of, made, reason_texts, smoothed
 
 from odocal_ros.calib.slip import find_slips, travel_error_sign
 from odocal_ros.estimator import smooth
-from odocal_ros.estimator.factors.factor import ACCEL_NOISE, VARIANCE_FACTOR_COUNT
 from odocal_ros.estimator.prepare import make_problem
-from odocal_ros.estimator.result import mismatch
-from odocal_ros.estimator.result.estimates import join_names
 from odocal_ros.estimator.result.residuals import find_unexplained_travel
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.nav.dead_reckoning import Track
@@ -28,6 +24,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.sim import routes
 from odocal_ros.sim.profile import hold, ramp
 from odocal_ros.sim.scenarios import SimOptions, simulate
+from odocal_ros.sim.wheels import low_pass_speed
 
 pytestmark = pytest.mark.slow
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
@@ -101,14 +98,6 @@ def test_aliased_vibration_is_an_imu_error_and_not_slip(noise):
     assert 'aliasing' in ' '.join(r.remedy for r in method.reasons
                                   if r.code is Code.IMU_WORSE_THAN_GRADE)
     assert off(method, drive, 'scale_factor', 'yaw_mounting_angle') < 3.3
-
-
-@pytest.mark.parametrize(('seconds', 'reported'), [(1, False), (2, False), (3, True)])
-def test_shock_in_a_short_drive_is_not_vibration(seconds, reported):
-    spread = np.ones((60, VARIANCE_FACTOR_COUNT))
-    spread[:seconds, ACCEL_NOISE] = 100.0
-    fit = SimpleNamespace(variance_factors=spread, levels={'accel': 0.005**2})
-    assert bool(mismatch._accelerometer_outlier_reasons(fit)) == reported
 
 
 def test_level_without_information_is_not_reported():
@@ -190,10 +179,9 @@ def test_held_speed_before_stops_is_not_slip():
 
 def low_passed(leg, seconds):
     """Return a leg whose counter follows the wheel with that time constant."""
-    t, s = leg.travel.t, leg.travel.s.copy()
-    for k in range(1, len(s)):
-        s[k] = s[k - 1] + (s[k] - s[k - 1]) * -np.expm1((t[k - 1] - t[k]) / seconds)
-    return replace(leg, travel=Travel(t, np.floor(s), leg.travel.quantum))
+    t, s = leg.travel.t, leg.travel.s
+    return replace(leg, travel=Travel(t, np.floor(low_pass_speed(s, t, seconds)),
+                                      leg.travel.quantum))
 
 
 def test_residual_of_a_filter_at_speed_changes_is_not_slip():
@@ -228,13 +216,6 @@ def test_slip_of_a_filtered_odometer_is_reported():
     first = method.details['slips'][0]
     assert first['metres'] == pytest.approx(pulses * drive.truth.scale, rel=0.3)
     assert 98.0 <= first['t'] <= 103.0
-
-
-def test_parameter_names_in_reasons_are_words():
-    arm = [f'antenna_lever_arm_{axis}' for axis in 'xyz']
-    assert join_names(arm) == 'the antenna lever arm'
-    assert join_names(['odometer_lever_arm_z', 'gnss_delay', *arm]) == (
-        'the odometer lever arm (up), the fix delay and the antenna lever arm')
 
 
 def result(**options):
@@ -275,11 +256,8 @@ def delayed(leg, seconds, how):
     sent = leg.odometer
     if how == 'late':
         return replace(leg, odometer=replace(sent, stamp_ns=sent.stamp_ns + round(seconds * 1e9)))
-    t, value = sent.stamp_ns * 1e-9, sent.value.copy()
-    for k in range(1, len(value)):
-        value[k] = value[k - 1] + (value[k] - value[k - 1]) * -np.expm1(
-            (t[k - 1] - t[k]) / seconds)
-    return replace(leg, odometer=replace(sent, value=value))
+    return replace(leg, odometer=replace(sent, value=low_pass_speed(
+        sent.value, sent.stamp_ns * 1e-9, seconds)))
 
 
 @pytest.mark.parametrize('how', ['late', 'low pass'])

@@ -182,31 +182,6 @@ def test_course_is_not_used_as_the_heading_for_the_yaw():
     assert combine([result], drives.settings(made)).imu_rotation_xyzw is None
 
 
-@pytest.mark.parametrize(('setting', 'late', 'scenario', 'stop'), [
-    ('odometer__time_offset', 'odometer_delay', 'town', 0.0),       # observable in turns
-    ('gnss__time_offset', 'fix_delay', 'straight', -90.0)])         # observable at 12 m/s
-def test_time_offsets_are_added_to_the_stamps(setting, late, scenario, stop):
-    """Stamps that are 0.2 s late are corrected by -0.2; +0.2 doubles the error."""
-    made = drives.drive(**CLEAN, scenario=scenario, duration=200.0, seed=2, **{late: 0.2})
-    leg = drives.shifted(made.leg(), stop=stop)
-    truth = np.array([made.truth.scale, made.truth.yaw])
-    off = {x: np.abs(found(made, drives.settings(made, **{setting: x}), leg)[:2] / truth - 1)
-           for x in (-0.2, 0.0, 0.2)}
-    worst = int(np.argmax(off[0.0]))
-    assert off[0.0][worst] > 1e-3
-    assert off[-0.2][worst] < 1e-3 * off[0.0][worst]
-    assert off[0.2][worst] == pytest.approx(2 * off[0.0][worst], rel=0.05)
-
-
-def test_imu_offset_is_the_negative_offset_of_the_other_sensors():
-    made = drives.drive(**CLEAN, scenario='town', duration=200.0, seed=2)
-    late = replace(made.leg(), imu=drives.changed(made.imu, stamp_ns=lambda a: a + 200_000_000),
-                   start_ns=made.truth.start_ns + 200_000_000,
-                   stop_ns=made.truth.stop_ns + 200_000_000)
-    np.testing.assert_allclose(found(made, drives.settings(made, imu__time_offset=-0.2), late),
-                               found(made), rtol=1e-6)
-
-
 def test_mark_between_rare_fixes_uses_one_of_them():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', fix_rate=0.2)
     for every in (1, 3):

@@ -27,7 +27,6 @@ from odocal_ros.sim.wheels import steered_path
 pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 250.0, 'imu_grade': 'industrial', 'sway': 0.05}
 AHEAD = 6.0      # m
-RTK = TOWN | {'fix_noise': 'rtk', 'fix_sigma': 0.01}
 
 
 def test_scale_that_decreases_with_speed_is_not_attributed_to_tyres():

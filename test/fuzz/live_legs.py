@@ -194,7 +194,6 @@ def received(drive, rows, config):
 
 
 def readers_form(readers):
-    """Return the form of the odometer."""
     return next(one.form for one in readers.values() if one.slot == 'odometer')
 
 

@@ -26,7 +26,6 @@ NUMBER = r'([\d.]+)'
 
 
 def run(name, monkeypatch, folder, *argv):
-    """Run a script in a folder with arguments."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, 'argv', [name, *map(str, argv)])
     runpy.run_path(str(EXAMPLES / name), run_name='__main__')

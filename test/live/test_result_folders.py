@@ -33,7 +33,6 @@ def driven():
 
 
 def drive_leg(driven, node, client):
-    """Drive a leg; check that it succeeds."""
     drive = Drive(node, client, driven, SPEED)
     drive.record(30, START_S, LAST_S)
     answer = drive.ended(LAST_S)

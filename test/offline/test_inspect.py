@@ -23,7 +23,6 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def inspect_drive(tmp_path, capsys):
-    """Return a function that writes rows to a bag and inspects it."""
     def written(rows, *options, types=None):
         path = ros_bags.write(tmp_path / f'bag_{len(list(tmp_path.iterdir()))}', rows, types=types)
         return inspect(path, capsys, *options)

@@ -25,7 +25,6 @@ TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])    # Rz(-9
 
 
 def estimates(unit='m/pulse', scale=0.05, ratio=1.25):
-    """Return the estimates of a two-point leg."""
     return {
         'scale_factor': Estimate(scale, 1.2e-6, unit),
         'scale_ratio': Estimate(ratio, None if ratio is None else 3e-5, '1'),

@@ -16,7 +16,6 @@ from odocal_ros.settings.config import Config
 
 @pytest.fixture
 def stored_objection(tmp_path):
-    """Return a function that gives the objection to replacing a stored calibration by another."""
     def run(old, new):
         for name, one in (('old', old), ('new', new)):
             write_results(one, Config(), tmp_path / name, [], CREATED, force=True)

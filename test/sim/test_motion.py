@@ -134,20 +134,6 @@ def test_integrated_imu_converges_to_the_truth_with_second_order(arm, drive):
     assert np.linalg.norm(p4 + (p4 - p2) / 3) < 4e-10
 
 
-def test_wheels_differ_by_track_times_turn_rate():
-    state = lively(slope=0.0).at(np.linspace(0, 20, 2001))
-    track = 1.6
-    left, right = (0.0, track / 2, 0.0), (0.0, -track / 2, 0.0)
-    difference = true_motion.contact_speed(state, right) - true_motion.contact_speed(state, left)
-    # the local level turns relative to the Earth by v tan(L) / R < 2e-6 rad/s
-    assert_allclose(difference, track * state.yaw_rate, atol=track * 2.1e-6)
-    assert np.abs(difference).max() > 0.3
-    rolled = true_motion.contact_travel(state, right) - true_motion.contact_travel(state, left)
-    assert rolled[-1] == pytest.approx(track * np.radians(100), abs=track * 2e-5)
-    mean = (true_motion.contact_travel(state, right) + true_motion.contact_travel(state, left)) / 2
-    assert_allclose(mean, state.travel, atol=1e-13)
-
-
 def test_going_east_turns_the_vehicle_against_the_earth():
     pieces = ramp(10, 20, 0.0) + hold(980) + ramp(10, -20, 0.0)
     motion = true_motion.Motion(chain(pieces).integral(), chain(hold(1000)),

@@ -13,7 +13,7 @@ from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_quat, matrix_
 from odocal_ros.settings.nominal import Grade, GRADES
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, Motion, rigid_imu_output, Start
-from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, random_walk, stamps, white
+from odocal_ros.sim.noise import gauss_markov, make_rng, PHASE, stamps, white
 from odocal_ros.sim.options import resolve, SimOptions
 from odocal_ros.sim.profile import chain, hold, ramp
 from odocal_ros.sim.scenarios import motion_of, simulate
@@ -58,13 +58,6 @@ def test_white_noise_has_its_density_at_any_rate(rate):
     # white: adjacent samples are uncorrelated, 5 / sqrt(n)
     together = (noise[1:] * noise[:-1]).mean() / noise.var()
     assert abs(together) < 5 / np.sqrt(3 * MANY)
-
-
-def test_a_random_walk_starts_at_zero_and_grows_with_the_root_of_time():
-    walk = random_walk(make_rng(3, 'test'), 0.1, 20.0, (1001, 3000))
-    assert (walk[0] == 0).all()
-    assert walk[1000].var() == pytest.approx(0.1**2 * 50, rel=sure(3000))
-    assert walk[250].var() == pytest.approx(0.1**2 * 12.5, rel=sure(3000))
 
 
 def test_gauss_markov_is_stationary_with_its_correlation_time():
@@ -243,8 +236,7 @@ def test_topics_are_not_sampled_together():
 def test_heading_topic_is_of_the_body_and_orientation_of_the_imu_axes():
     sideways = (np.pi / 2, 0.0, -np.pi / 2)
     drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_rate=20.0,
-                                mounting_rpy=sideways, heading_sigma=1e-9,
-                                orientation_sigma=1e-9))
+                                mounting_rpy=sideways, heading_sigma=1e-9, orientation_sigma=1e-9))
 
     def yaw(q):
         C = matrix_from_quat(q)
