@@ -9,7 +9,7 @@ from typing import Any
 from odocal_ros.calib.drive import speed_reason
 from odocal_ros.library.topics import NO_MESSAGES_REMEDY, topics_without_messages
 from odocal_ros.offline.inspection_drive import is_closed
-from odocal_ros.offline.topic_notes import missing_odometer_texts
+from odocal_ros.offline.topic_notes import missing_input_texts
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
@@ -60,7 +60,7 @@ def _topic_reasons(content: dict[str, Any], mapping: dict[str, str],
         if not facts and (slot != 'imu' or config.odometer.needs_imu):
             empty = topics_without_messages(
                 {name: (topic['type'], topic['count']) for name, topic in topics.items()}, slot)
-            cause, action = missing_odometer_texts(content) if slot == 'odometer' else ('', '')
+            cause, action = missing_input_texts(slot, content, mapping)
             reasons.append(Reason(
                 code, f'{", ".join(empty)} has no messages', NO_MESSAGES_REMEDY) if empty else
                 Reason(code, f'no topic for the {label}{cause}', action + remedy))

@@ -12,7 +12,7 @@ from odocal_ros.library.topics import is_estimate
 MAX_NAMES = 6      # judgement: topics in a note
 CONVERT = ("convert the bag to mcap with 'ros2 bag convert' where these packages are installed "
            '(docs/from_a_bag.md)')
-RAW_CAN = 'can_msgs/msg/Frame'
+RAW_CAN, ODOMETRY = 'can_msgs/msg/Frame', 'nav_msgs/msg/Odometry'
 Quantities = Mapping[str, tuple[bool, bool]]     # IMU topic -> has turn rates, has specific forces
 
 
@@ -55,7 +55,20 @@ def undefined_text(undefined: Mapping[str, str]) -> str:
             + ', '.join(names[:MAX_NAMES]) + more)
 
 
-def missing_odometer_texts(content: Mapping[str, Any]) -> tuple[str, str]:
+def missing_input_texts(slot: str, content: Mapping[str, Any],
+                        mapping: Mapping[str, str]) -> tuple[str, str]:
+    """Return the text on what a bag has in place of an input, and the action; '' if nothing."""
+    if slot == 'odometer':
+        return _odometer_texts(content)
+    poses = [topic['name'] for topic in content['topics'] if topic['type'] == ODOMETRY
+             and topic['count'] and topic['name'] != mapping.get('odometer')]
+    if slot != 'fix' or not poses:
+        return '', ''
+    return (f'; {", ".join(poses[:MAX_NAMES])}: poses of nav_msgs/Odometry',
+            f'If their positions do not contain the odometer, add --fix-topic {poses[0]}. ')
+
+
+def _odometer_texts(content: Mapping[str, Any]) -> tuple[str, str]:
     """Return the text on unreadable topics of a bag without odometer, and the action, or ''."""
     undefined = content['undefined']
     frames = [topic['name'] for topic in content['topics'] if topic['type'] == RAW_CAN]

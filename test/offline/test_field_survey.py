@@ -44,9 +44,9 @@ def types():
     return store
 
 
-def write(path, made, more):
+def write(path, made, more, has_fixes=True):
     """Write IMU and fixes of a drive, and (topic, bag time, message) rows of its vehicle."""
-    topics = imu('/imu/data', made.imu), fix('/fix', made.fix)
+    topics = [imu('/imu/data', made.imu), *[fix('/fix', made.fix)] * has_fixes]
     rows = [(topic.name, topic.msgtype, int(t), row.tobytes()) for topic in topics
             for t, row in zip(topic.time_ns, topic.pack(slice(0, len(topic.time_ns))),
                               strict=True)]
@@ -300,6 +300,19 @@ def test_raw_can_frames_are_not_searched(tmp_path, capsys):
     assert 'odometer' not in found['mapping']
     text = ' '.join(text.split())
     assert 'no topic for the odometer; /can: raw CAN frames. Decode the wheel speeds' in text
+
+
+def test_missing_fixes_name_the_poses_of_the_bag(tmp_path, capsys):
+    """The positions of navsat_transform are an Odometry, which only the user can select."""
+    made = town()
+    path = write(tmp_path / 'bag', made, [('/odometry/gps', t, message) for _, t, message in
+                                          estimates(made)] + [
+        ('/ticks', t, make.whole(int(count))) for t, count in zip(
+            made.odometer.stamp_ns.tolist(), made.odometer.value.tolist(), strict=True)],
+        has_fixes=False)
+    text = ' '.join(inspected(path, capsys)[1].split())
+    assert ('no topic for the fixes; /odometry/gps: poses of nav_msgs/Odometry. If their '
+            'positions do not contain the odometer, add --fix-topic /odometry/gps.') in text
 
 
 def test_gyro_and_accelerometer_on_two_topics_are_named(tmp_path, capsys):
