@@ -153,10 +153,12 @@ def counter_change_reasons(scales: Sections, t_fix: Floats,
     log_scale, sigma = np.log(scales.ratio[known]), scales.sigma[known]
     changes: dict[float, tuple[int, float]] = {}      # by scatter over change: section, factor
     for k in range(1, len(known) - 1):
-        sides = [log_scale[:k], log_scale[k + 1:]]
-        before, after = (np.median(side) for side in sides)
-        scatter = max(np.ptp(side) for side in sides)
-        sigma_of_change = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
+        sides = slice(k), slice(k + 1, None)
+        before, after = (np.median(log_scale[side]) for side in sides)
+        # a single section may be an outlier: its scatter is taken as that of its errors
+        scatter = max(np.ptp(log_scale[side]) if len(log_scale[side]) > 1
+                      else REMARK_SIGMAS * sigma[side][0] for side in sides)
+        sigma_of_change = np.hypot(*(sigma[side].max() for side in sides))
         if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * sigma_of_change,
                                      scatter / SIDE_SCATTER):
             changes.setdefault(scatter / abs(after - before), (

@@ -182,8 +182,11 @@ def test_change_without_effect_is_not_reported(constant):
     ([1.0] * 5 + [1e-6] * 5, 1e-3, 'Likely cause: the position or the counter is frozen'),
     ([1.0] * 10, 1e-3, ''), ([1.01] * 5 + [0.99] * 5, 1e-4, ''),
     ([1.05] * 5 + [0.95] * 5, 0.05, ''), ([1.0] * 4 + [0.7] + [1.0] * 5, 1e-3, ''),
-    (np.linspace(0.9, 1.1, 10), 1e-3, ''), ([1.0] * 5 + [np.nan] * 5, 1e-3, '')],
-    ids=['halved', 'doubled', 'frozen', 'constant', 'tyres', 'uncertain', 'slip', 'drift', 'half'])
+    (np.linspace(0.9, 1.1, 10), 1e-3, ''), ([1.0] * 5 + [np.nan] * 5, 1e-3, ''),
+    ([0.93] + [1.0] * 9, 0.015, ''), ([1.0] * 9 + [0.93], 0.015, ''),
+    ([2.0] + [1.0] * 9, 0.015, '2.00 times')],
+    ids=['halved', 'doubled', 'frozen', 'constant', 'tyres', 'uncertain', 'slip', 'drift', 'half',
+         'multipath at first', 'multipath at last', 'doubled at first'])
 def test_counter_change_is_found_with_place_and_factor(ratio, sigma, text):
     """Ten sections of 100 m in 10 s each."""
     edges = np.linspace(0.0, 1000.0, len(ratio) + 1)
