@@ -57,7 +57,8 @@ LEVER_ARM_AXES = 'Axes: from base_link, x forward, y left, z up.'
 CAUSES_OF_ARM_SHIFT = {     # other causes of a deviating lever arm, by its axes
     'xy': 'Slip in turns (skid steering, tracks) also shifts x and y; if that is the cause, keep '
           'the setting.',
-    'z': 'Body roll on soft springs also shifts z; if that is the cause, keep the setting.'}
+    'z': 'Body roll on soft springs, or an antenna mast that bends, also shifts z; if that is the '
+         'cause, keep the setting.'}
 
 
 def map_scale_sigma(problem: Problem, c: Floats, sigma: Floats) -> float:
