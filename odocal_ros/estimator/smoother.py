@@ -86,11 +86,10 @@ def _fix_speed_offset(problem: Problem, current: Fit, trace: Trace | None) -> Fi
     summary = current.summary()
     del current             # its equations: only one fit is in memory at a time
     is_offset = np.arange(M) == SPEED_OFFSET
-    priors, initial_priors = (
-        replace(x, mean=np.where(is_offset, nearer, x.mean),
-                sigma=np.where(is_offset, 1e-3 * coarse.step, x.sigma))     # practically fixed
-        for x in (summary.priors, summary.initial_priors))
-    warm_start = replace(summary, priors=priors, initial_priors=initial_priors)
+    priors = summary.priors
+    fixed = replace(priors, mean=np.where(is_offset, nearer, priors.mean),
+                    sigma=np.where(is_offset, 1e-3 * coarse.step, priors.sigma))
+    warm_start = replace(summary, priors=fixed)
     last = fit(problem, replace(warm_start.state, constants=constants), warm_start.levels,
                WARM_START_PASSES, warm_start=warm_start, frozen=True, trace=trace)
     return replace(last, iterations=warm_start.iterations + last.iterations)

@@ -9,6 +9,7 @@ from drives import cached, off, reason_texts, settings
 import numpy as np
 import pytest
 
+from odocal_ros.calib.joint import fit_jointly
 from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
@@ -104,6 +105,24 @@ def test_truncation_and_rounding_are_distinguished(how, share):
     assert offset['value'] == pytest.approx(share * KMH, abs=3 * offset['sigma'])
     assert offset['sigma'] < KMH / 20
     assert 'resolution is 0.278 m/s (1 km/h)' in reason_texts(result)[Code.SPEED_COARSE]
+
+
+def test_truncation_found_in_one_leg_holds_in_a_leg_without_information():
+    _, result = calibrated()
+    marginal = result.methods['smoother'].marginal
+    offset = marginal.names.index('speed_offset')
+    # rounding and truncation are equally likely before the drive
+    prior = {name: np.where(np.arange(len(marginal.names)) == offset, KMH / 4,
+                            getattr(marginal, name))
+             for name in ('prior_mean', 'prior_sigma', 'relaxed_sigma')}
+    empty = replace(marginal, information=np.zeros_like(marginal.information),
+                    gradient=np.zeros_like(marginal.gradient), **prior)
+    alone, both = (fit_jointly(legs, [0.0] * (len(legs) - 1), same_drive=[True] * (len(legs) - 1))
+                   for legs in ([marginal], [marginal, empty]))
+    assert both.value[offset] == pytest.approx(KMH / 2, abs=KMH / 500)
+    scale = marginal.names.index('scale_factor')
+    np.testing.assert_allclose(both.covariance[scale, scale], alone.covariance[scale, scale],
+                               rtol=1e-4)     # the shortest random walk
 
 
 @pytest.mark.parametrize('nominal', [KMH, 1.0])

@@ -120,7 +120,8 @@ def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformatio
     Return the marginal information of a fit at its last linearisation point, (S33).
 
     It is the Schur complement of the constants minus the weights of their priors, and zero for
-    constants that are fixed in the leg, or that other legs do not share.
+    constants that are fixed in the leg, or that other legs do not share. A speed offset that the
+    leg has selected is information: it holds in all legs.
 
     setting_values : (M,) as ``configured_constants``.
     """
@@ -131,14 +132,16 @@ def marginal_information(fit: Fit, setting_values: Floats) -> MarginalInformatio
     gain = np.linalg.solve(leg_rows[:, layout.LEG_CONSTANTS], leg_rows).T
     g_reduced = g_reduced - gain @ g_reduced[layout.LEG_CONSTANTS]
     reduced = reduced - gain @ leg_rows
-    weight = 1 / priors.sigma**2
-    free = priors.sigma > layout.NO_ERROR
+    mean, sigma = fit.initial_priors.mean, priors.sigma.copy()
+    sigma[layout.SPEED_OFFSET] = fit.initial_priors.sigma[layout.SPEED_OFFSET]
+    weight = 1 / sigma**2
+    free = sigma > layout.NO_ERROR
     free[layout.LEG_CONSTANTS] = False
     return MarginalInformation(
         layout.CONSTANTS, constants + setting_values,
         (reduced - np.diag(weight)) * np.outer(free, free),
-        (g_reduced + weight * (constants - priors.mean)) * free, priors.mean + setting_values,
-        fit.initial_priors.sigma, priors.sigma).with_errors(
+        (g_reduced + weight * (constants - mean)) * free, mean + setting_values,
+        fit.initial_priors.sigma, sigma).with_errors(
             fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data
 
 
