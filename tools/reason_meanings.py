@@ -38,11 +38,11 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'that share a stamp are all used, at even times since the packet before.',
         Code.IMU_GAP: 'The IMU is silent, or repeats one value, for longer than `leg.max_gap`. '
         'The turns of the vehicle in this time are unknown, so the track is lost.',
-        Code.LEG_CUT: 'The IMU was silent for longer than `leg.max_gap`. The leg is cut there; '
-        'its sections are calibrated as legs and combined. A section too short to calibrate is '
-        'left out. If no section is long enough, the leg is rejected (`IMU_GAP`). Or the vehicle '
-        'was carried, as by a ferry: the fixes move by 100 m or more, or by 20 m or more in more '
-        'than 20 s, and the odometer only counts before and after it.',
+        Code.LEG_CUT: 'The IMU was silent, or repeated one value, for longer than `leg.max_gap`. '
+        'The leg is cut there; its sections are calibrated as legs and combined. A section too '
+        'short to calibrate is left out. If no section is long enough, the leg is rejected '
+        '(`IMU_GAP`). Or the vehicle was carried, as by a ferry: the fixes move by 100 m or more, '
+        'or by 20 m or more in more than 20 s, and the odometer only counts before and after it.',
         Code.TOPIC_GAP: 'Odometer or fixes are silent for more than five of their usual '
         'intervals, or the odometer starts late or ends early. Or IMU, odometer or fixes cover '
         'only a part of a recording without marks (10 s or more are missing): the leg is limited '

@@ -5,8 +5,8 @@
 The pipeline: ``calibrate`` from a leg to its result, ``combine`` from results to a calibration.
 
 Pure functions without state, clock or files, called by the node and the replay. A leg is cut at
-gaps of the IMU, and at sections where the vehicle was carried (``calibrate_parts``); its parts are
-legs of the same vehicle.
+gaps of the IMU, and at sections where its gyro is frozen or the vehicle was carried
+(``calibrate_parts``); its parts are legs of the same vehicle.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +28,8 @@ from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
-from odocal_ros.screening.clocks import with_delay_sigmas, without_clock_steps
+from odocal_ros.screening.clocks import stamp_offsets, with_delay_sigmas, without_clock_steps
+from odocal_ros.screening.glitches import frozen_gyro_spans
 from odocal_ros.screening.imu_faults import gravity_turn_reasons, unit_change_reasons
 from odocal_ros.screening.imu_orientation import unit_and_axis_reasons, UNUSABLE
 from odocal_ros.screening.inputs import Inputs, locate_fixes
@@ -188,6 +189,13 @@ def _carried_sections(leg: Leg, config: Config) -> Ints:
     return leg.start_ns + np.round(spans * 1e9).astype(np.int64)
 
 
+def _frozen_sections(leg: Leg, config: Config) -> Ints:
+    """Return begin and end of the sections with a frozen gyro, ns: (k, 2)."""
+    inputs = screen_leg(leg, config).inputs
+    spans = frozen_gyro_spans(inputs.t_imu, inputs.w_b, inputs.travel, config.leg.max_gap)
+    return leg.start_ns + np.round((spans - stamp_offsets(config)['imu']) * 1e9).astype(np.int64)
+
+
 def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
                     holdout: bool = False,
                     progress: Callable[[Stage], None] | None = None) -> list[LegResult]:
@@ -207,13 +215,15 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
     cause, remedy = f'no IMU data for more than {config.leg.max_gap:g} s', ''
     if not usable:
         whole_leg = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
-        still_reason = next((reason for reason in whole_leg.reasons
-                             if reason.code is Code.ODOMETER_STILL), None)
-        if still_reason:
+        texts = {reason.code: reason.text for reason in whole_leg.reasons}
+        if Code.ODOMETER_STILL in texts:
             usable = usable_results(parts_between(leg, _carried_sections(leg, config)))
-            cause, remedy = still_reason.text, (
+            cause, remedy = texts[Code.ODOMETER_STILL], (
                 'If the vehicle was carried (ferry, train), ignore. Otherwise check the wheel '
                 'sensor and the odometer topic.')
+        elif Code.IMU_GAP in texts:
+            usable = usable_results(parts_between(leg, _frozen_sections(leg, config)))
+            cause = texts[Code.IMU_GAP]
         if not usable:
             return [whole_leg]
     if [(part.start_ns, part.stop_ns) for part in usable] == [(leg.start_ns, leg.stop_ns)]:

@@ -188,33 +188,39 @@ def speed_glitches(t: Floats, speed: Floats) -> Bools:
     return find_spikes(t, speed[:, None], max(min_share * top, 1e-12))
 
 
-def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:
+def frozen_gyro_spans(t: Floats, w: Floats, travel: Travel, limit: float) -> Floats:
     """
-    Return IMU_GAP if the gyro repeats exactly one value while the wheels roll.
+    Return begin and end, s, (k, 2), where a gyro repeats exactly one value while the wheels roll.
 
     t, w : (n,) s, (n, 3) rad/s.   travel : of the odometer.   limit : s, longest allowed gap.
     Accepted are a gyro that measures zero (``dead_band_reasons``) and one that often repeats its
     value (coarse steps).
     """
     if len(t) < 2 or len(travel.t) < 2:
-        return ()
+        return np.empty((0, 2))
     repeats = map_windows(lambda w: reduce_columns(np.logical_and, w[1:] == w[:-1])
                           & reduce_columns(np.logical_or, w[1:] != 0), w)
     spans = runs(repeats)
     begin, end = t[spans].T
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)
     mean_speed = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)
-    frozen = np.flatnonzero((end - begin > limit)
-                            & (mean_speed > ROLLING_SHARE * np.percentile(speed, 95)))
+    frozen = ((end - begin > limit)
+              & (mean_speed > ROLLING_SHARE * np.percentile(speed, 95)))
     frozen_rows = np.diff(spans[frozen]).sum()
     coarse_share = 0.2      # judgement: share of the other rows; fine gyros have no repeats
-    if not len(frozen) or (
-            repeats.sum() - frozen_rows > coarse_share * (len(repeats) - frozen_rows)):
+    is_coarse = repeats.sum() - frozen_rows > coarse_share * (len(repeats) - frozen_rows)
+    return np.empty((0, 2)) if is_coarse else t[spans[frozen]]
+
+
+def frozen_gyro_reasons(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:
+    """Return IMU_GAP for the longest of the spans that ``frozen_gyro_spans`` returns."""
+    frozen = frozen_gyro_spans(t, w, travel, limit)
+    if not len(frozen):
         return ()
-    longest = frozen[np.argmax((end - begin)[frozen])]
-    return (Reason(Code.IMU_GAP, 'the gyro repeats one value for '
-                   f'{end[longest] - begin[longest]:.2f} s at t = {begin[longest]:.2f} s while '
-                   f'the wheels turn (limit {limit:g} s): its output is frozen'),)
+    begin, end = frozen[np.argmax(np.diff(frozen)[:, 0])]
+    return (Reason(Code.IMU_GAP, f'the gyro repeats one value for {end - begin:.2f} s at '
+                   f't = {begin:.2f} s while the wheels turn (limit {limit:g} s): its output is '
+                   'frozen'),)
 
 
 def dead_band_reasons(t: Floats, w: Floats, travel: Travel) -> tuple[Reason, ...]:

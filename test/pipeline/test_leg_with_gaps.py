@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import drive, off, seconds, settings, without
+from drives import drive, off, seconds, settings, with_columns, without
 import numpy as np
 import pytest
 
@@ -90,6 +90,24 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
         # an angle that they dominate may be 1 % less certain than in the better part
         assert whole.estimates[name].sigma < 1.02 * min(
             one.methods['smoother'].estimates[name].sigma for one in results), name
+
+
+def test_a_leg_is_cut_where_its_gyro_is_frozen(made):
+    leg, config = made.leg(), settings(made, method='two_point')
+    first, last = np.searchsorted(seconds(leg, leg.imu), GAP)
+    frozen = with_columns(leg, 'imu', w_i=(slice(first, last + 1), leg.imu.w_i[first]))
+    without_rows = replace(leg, imu=take(leg.imu, np.r_[:first + 1, last:len(leg.imu.stamp_ns)]))
+    results, expected = (calibrate_parts(one, config) for one in (frozen, without_rows))
+    assert len(results) == 2
+    assert [(r.start_ns, r.stop_ns) for r in results] == [
+        (r.start_ns, r.stop_ns) for r in expected]
+    for result in results:
+        assert not {Code.IMU_GAP, Code.CHANGE_IN_LEG} & {r.code for r in result.reasons}
+        assert result.reasons[-1].code is Code.LEG_CUT
+        assert 'its output is frozen; this section covers' in result.reasons[-1].text
+    # one row remains that is frozen
+    assert off(combine(results, config), made, SCALE) == pytest.approx(
+        off(combine(expected, config), made, SCALE), abs=0.01)
 
 
 @pytest.mark.parametrize('by', [0.6, 3.0])
