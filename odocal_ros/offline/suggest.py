@@ -17,7 +17,8 @@ from odocal_ros.settings.config import Config, with_settings
 WHEEL_WORDS = ('pulse', 'tick', 'encoder', 'wheel', 'count', 'chassis', 'controller', 'vehicle',
                '/can', 'obd')
 # judgement: words in topics of IMUs inside other sensors
-OTHER_DEVICE_WORDS = ('zed', 'camera', 'lidar', 'livox', 'ouster')
+OTHER_DEVICE_WORDS = ('zed', 'camera', 'realsense', 'd435', 'd455', 't265', '/oak', 'stereo',
+                      'lidar', 'livox', 'ouster', 'os_cloud', 'hesai', 'velodyne')
 
 
 def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
@@ -61,9 +62,10 @@ def _sort_keys(slot: str, info: TopicInfo, unsuitable: Collection[str]) -> dict[
     if 'odometer' in slot:
         fits = 2 * any(word in name for word in WHEEL_WORDS) or 'odom' in name
         kind = next(i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype)
+    is_usual = info.name.endswith(usual_name) and bool(fits or slot != 'imu')
     return {needed: info.name in unsuitable,
             'counts are preferred to joint angles, and angles to speeds': kind,
-            'it has the usual name': not info.name.endswith(usual_name), 'its name fits': -fits,
+            'it has the usual name': not is_usual, 'its name fits': -fits,
             'it has the most messages': -info.count, 'it is the first by name': info.name}
 
 

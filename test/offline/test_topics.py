@@ -227,6 +227,15 @@ def test_left_and_right_topics_are_chosen_as_a_pair_among_others(names):
     assert config.odometer.left == config.odometer.right == 'topic'
 
 
+@pytest.mark.parametrize(('own', 'other'), [
+    ('/vectornav/imu', '/zed/zed_node/imu/data'), ('/imu', '/oak/imu/data'),
+    ('/mti/imu', '/os_cloud_node/imu'), ('/imu/data_raw', '/realsense/imu')])
+def test_an_imu_of_its_own_is_preferred_to_one_with_the_usual_name_in_a_camera(own, other):
+    found = {n: TopicInfo(n, t, 5) for n, t in BASE.items() if n != '/imu/data'} | {
+        own: TopicInfo(own, IMU, 5), other: TopicInfo(other, IMU, 500)}
+    assert likely_mapping(found, Config(), {})[0]['imu'] == own
+
+
 def test_imus_of_cameras_and_lidars_come_last():
     found = {n: TopicInfo(n, t, count) for n, t, count in (
         ('/zed/zed_node/imu/data', IMU, 400), ('/livox/imu', IMU, 200),
