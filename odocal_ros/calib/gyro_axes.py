@@ -75,14 +75,19 @@ def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientati
     if not any(reason.code is Code.GYRO_SIGN for reason in reasons):
         axis_reasons = wrong_axis_reasons(inputs, located, orientation)
         return ratio, axis_reasons if axis_reasons else reasons
-    text = reasons[0].text
+    text, remedy = reasons[0].text, '' if inputs.has_accelerometer else (
+        'Set imu.mounting_rpy, or correct the sign in the IMU driver.')
     if orientation and abs(orientation.centripetal) > max(
             -INVERTED_RATIO, SIGN_SIGMAS * orientation.centripetal_sigma):
-        text += (', and to the accelerations in turns: angular_velocity has the wrong sign'
-                 if orientation.centripetal < 0 else ', but match the accelerations in turns: '
-                 'latitude and longitude (x and y) are swapped, or linear_acceleration is negated')
-    return ratio, (Reason(Code.GYRO_SIGN, text, '' if inputs.has_accelerometer else
-                          'Set imu.mounting_rpy, or correct the sign in the IMU driver.'),)
+        if orientation.centripetal < 0:
+            text += ', and to the accelerations in turns: angular_velocity has the wrong sign'
+        else:
+            text += (', but match the accelerations in turns: latitude and longitude (x and y) '
+                     'are swapped, or linear_acceleration is negated')
+            remedy = ('Swap latitude and longitude in the driver of the fixes, or negate '
+                      'linear_acceleration in the IMU driver: what a map or a level IMU shows '
+                      f'to be wrong. {NO_ROTATION}')
+    return ratio, (Reason(Code.GYRO_SIGN, text, remedy),)
 
 
 def wrong_axis_reasons(inputs: Inputs, located: LocatedFixes,

@@ -142,6 +142,7 @@ def test_third_sensor_identifies_the_wrong_sign(topic, changes, cause):
     assert cause in found.text
     assert ('Set imu.mounting_rpy' in found.special_remedy) == (
         'f_i' in changes and cause == 'expected: 1)')
+    assert ('Swap latitude and longitude' in found.special_remedy) == ('longitude (x' in cause)
 
 
 def test_mirrored_gyro_is_found_by_accelerations_with_few_fixes():
