@@ -9,6 +9,7 @@ They are the mounting of the IMU, units, the legs that replay would use, and oth
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+import math
 from typing import Any
 
 import numpy as np
@@ -160,6 +161,8 @@ def _unit_options(inputs: Inputs, config: Config) -> tuple[list[str], Floats, Fl
 def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
     """Return the option that removes gnss.max_sigma if this limit drops most of the fixes."""
     rows = recorder.rows('fix')
+    if math.isnan(config.gnss.max_sigma):
+        return []
     all_count, kept = (int(usable_fixes(rows, 0, replace(config.gnss, max_sigma=limit))[0].sum())
                        for limit in (0.0, config.gnss.max_sigma))
     return ['gnss.max_sigma=nan'] if kept < all_count / 2 else []

@@ -21,6 +21,8 @@ from odocal_ros.settings.levels import FIX_NOISE_LIMIT, REMARK_SIGMAS
 # 1.5 m: without a limit the sigma of the scale is 1.2 to 24 times as large, as correlated errors
 # have one level; error over sigma is the same. A drive with fixes of 3 to 7 m fails with it
 DEFAULT_SIGMA_LIMIT = 3.0
+# m, physical: no receiver with a position is less accurate; some drivers state more for unknown
+LARGEST_SIGMA = 1000.0
 # s, length of compared displacements: judgement, longer than delays of receivers
 DISPLACEMENT_WINDOW = 10.0
 VELOCITY_GAP = 2.0    # s, judgement: a longer one hides a change of speed
@@ -64,9 +66,10 @@ def usable_fixes(fix: FixSamples, received_count: int, gnss: GnssConfig,
         (invalid & ~no_fix, _invalid_text(fix, invalid & ~no_fix), 'Check the driver: latitude '
          'and longitude in degrees (swapped?), altitude in m, no 0, 0 in place of a missing '
          'position.'),
-        (inaccurate & ~no_fix & ~invalid, f'with sigma above {limit:.3g} m', 'If these '
+        (inaccurate & ~no_fix & ~invalid, f'with sigma above {limit:.4g} m', 'If these '
          'uncertainties are correct, raise gnss.max_sigma (0: no limit): each fix is weighted by '
-         'its own uncertainty.')) if mask.any()]
+         'its own uncertainty.' if limit < LARGEST_SIGMA else 'Correct the driver: a sigma that '
+         'is not known has position_covariance_type 0, not a large number.')) if mask.any()]
     if rejected:
         code = Code.BAD_ROWS_DROPPED if usable.any() else Code.FIXES_UNUSABLE
         causes, remedies = zip(*rejected, strict=True)
@@ -90,7 +93,8 @@ def sigma_limit(sigma: Floats, max_sigma: float) -> float:
     """Return the limit of the horizontal sigmas of fixes, (n,) m; inf: none."""
     if not np.isnan(max_sigma):
         return max_sigma or np.inf
-    return max(DEFAULT_SIGMA_LIMIT, 2 * float(np.median(sigma)) if len(sigma) else 0.0)
+    median_sigma = float(np.median(sigma)) if len(sigma) else 0.0
+    return min(max(DEFAULT_SIGMA_LIMIT, 2 * median_sigma), LARGEST_SIGMA)
 
 
 def has_position(fix: FixSamples) -> Bools:

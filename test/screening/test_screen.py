@@ -126,6 +126,12 @@ def test_poor_fixes_are_excluded_beyond_a_limit_that_rises_with_the_median(leg):
     assert screen_with(poor)[1][Code.BAD_ROWS_DROPPED].endswith('6 with sigma above 8 m')
     _, codes = screen_with(poor, gnss__max_sigma=3.0)
     assert codes[Code.FIXES_UNUSABLE].endswith('with sigma above 3 m')
+    # a large number in place of an unknown sigma
+    _, (reason,) = screen(with_columns(
+        leg, 'fix', covariance_n=(slice(None), 1e8 * np.eye(3))), Config())
+    assert reason.code is Code.FIXES_UNUSABLE
+    assert reason.text.endswith('with sigma above 1000 m')
+    assert 'position_covariance_type 0' in reason.remedy
     poor = with_columns(leg, 'fix', covariance_n=(slice(100, 300), 25 * np.eye(3)))
     inputs, (reason,) = screen(poor, Config())
     assert reason.code is Code.BAD_ROWS_DROPPED
