@@ -19,6 +19,10 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
 
+# judgement: a receiver that states 0.5 m can drift by 20 m at rest, and one with RTK by 0.5 m;
+# four lengths of certain motion fit in the extent of a drive
+MOTION_SIGMAS, EXTENT_PER_MOTION = 40.0, 4.0
+
 
 class UsableRows(NamedTuple):
     """The usable rows of a topic, as sent, and their times from the start mark: (n,) s."""
@@ -82,10 +86,18 @@ class Inputs:
         """Return the direction of the median specific force: (3,) unit vector, 0 without force."""
         return self.median_f_b / max(float(np.linalg.norm(self.median_f_b)), 1e-9)
 
-    @property
+    @cached_property
     def min_motion(self) -> float:
         """Return the minimum distance between positions that is certainly motion, m."""
-        return geodesy.MIN_LOCAL_MOTION if self.is_local else geodesy.MIN_GNSS_MOTION
+        if self.is_local or not len(self.t_fix):
+            return geodesy.MIN_LOCAL_MOTION if self.is_local else geodesy.MIN_GNSS_MOTION
+        # an accurate receiver shows the motion of a robot on a lawn of a few metres
+        sigma = _horizontal_sigma(self.covariance_n)
+        horizontal = median_origin(self.t_fix, self.geodetic).to_n(
+            np.nan_to_num(self.geodetic))[:, :2]
+        extent = float(np.hypot(*np.ptp(np.quantile(horizontal, [0.01, 0.99], axis=0), axis=0)))
+        return float(np.clip(extent / EXTENT_PER_MOTION, max(
+            geodesy.MIN_LOCAL_MOTION, MOTION_SIGMAS * sigma), geodesy.MIN_GNSS_MOTION))
 
     def standstills(self, metres_per_unit: float, config: Config) -> Floats:
         """Return the standstills of ``leg.standstill`` or longer, begin and end: (k, 2) s."""
@@ -125,10 +137,15 @@ def locate_fixes(inputs: Inputs, config: Config) -> LocatedFixes:
     geodetic[no_height, 2] = origin.height
     fixes_n = origin.to_n(geodetic)
     fixes_n[no_height, 2] = np.nan
-    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
+    sigma = _horizontal_sigma(inputs.covariance_n)
     rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma,
                         inputs.min_motion) or nominal
     return LocatedFixes(origin, fixes_n, sigma, nominal, rough)
+
+
+def _horizontal_sigma(covariance_n: Floats) -> float:
+    """Return the median 1 sigma of a horizontal axis of fixes, m; covariance_n : (k, 3, 3) m^2."""
+    return float(np.sqrt(np.median(covariance_n[:, 0, 0])))
 
 
 def median_origin(t_fix: Floats, geodetic: Floats) -> Origin:

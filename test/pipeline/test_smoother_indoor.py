@@ -3,6 +3,8 @@
 
 """The smoother in a local frame: robots, whose runs are short and slow."""
 
+from dataclasses import replace
+
 import drives
 from drives import off
 import numpy as np
@@ -63,6 +65,25 @@ def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit, noise):
         assert smoother.details['noise']['fix'] * stated == pytest.approx(noise, rel=0.1)
     assert off(found, made, 'scale_factor', 'yaw_mounting_angle', 'track_width',
                'scale_factor_left', 'scale_factor_right') < 3
+
+
+def test_a_robot_on_a_lawn_of_a_few_metres_has_a_result_with_rtk():
+    """Its fixes stay within 20 m, which a receiver without corrections does at rest."""
+    made = simulate(SimOptions(scenario='indoor', duration=120.0, seed=3, imu_rate=50.0,
+                               reference='total_station'))
+    leg, variance = made.leg(), 0.014**2
+    config = with_settings(drives.configured(made), {'leg.min_distance': 2.0,
+                                                     'leg.min_speed': 0.1})
+    count = len(leg.fix.status)
+    fix = replace(leg.fix, status=np.full(count, 2), covariance_type=np.full(count, 3),
+                  covariance_n=np.full((count, 1, 1), variance) * np.eye(3))
+    result = calibrate(replace(leg, fix=fix), config)
+    assert not {r.code for r in result.reasons} & {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}
+    assert off(result.methods['smoother'].estimates, made, 'scale_factor', 'track_width') < 3
+    # fixes that may move as far at rest
+    fix = replace(fix, covariance_n=np.full((count, 1, 1), 2.5**2) * np.eye(3))
+    reason, = calibrate(replace(leg, fix=fix), config).reasons
+    assert 'the fixes do not move' in reason.text
 
 
 def test_limits_are_the_smaller_of_the_setting_and_that_of_the_frame():
