@@ -21,11 +21,11 @@ ZOO = [    # kind, grade, verdict, errors of NAMES over their sigmas
     ('out_and_back', 'tactical', 'accepted', (-0.69, 0.2, 0.24)),
     ('motorway', 'consumer', 'accepted', (0.95, -0.2, -0.6)),
     ('yard', 'industrial', 'caution', (-0.62, -1.24, 0.14)),
-    ('town', 'tactical', 'caution', (-0.08, -0.51, 1.91)),
+    ('town', 'tactical', 'caution', (-0.13, -0.62, 1.83)),
     ('straight', 'consumer', 'accepted', (0.96, 1.09, None)),
     ('out_and_back', 'industrial', 'caution', (-1.92, 1.25, 0.92)),
     ('motorway', 'tactical', 'accepted', (1.38, 0.16, -0.07)),
-    ('yard', 'consumer', 'caution', (0.85, 0.62, 0.21)),
+    ('yard', 'consumer', 'caution', (0.67, 0.51, 0.35)),
     ('town', 'industrial', 'caution', (-0.64, -0.88, 0.25)),
     ('straight', 'tactical', 'accepted', (-0.8, -1.17, 0.86))]
 

@@ -13,6 +13,7 @@ from odocal_ros.estimator.equations import EXTERNAL_FACTORS, FACTORS
 from odocal_ros.estimator.factors.axle import mean_rates_at, WARM_TIME
 from odocal_ros.estimator.factors.gnss import inverse_cholesky
 from odocal_ros.estimator.factors.interval_noise import total_turn
+from odocal_ros.estimator.factors.odometer import brief_accelerations
 from odocal_ros.estimator.factors.pseudo_observations import SHARED
 from odocal_ros.estimator.imu import (
     ImuSteps,
@@ -107,6 +108,7 @@ def make_problem(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) 
         unshared_constants=unshared_constants, total_turn=total_turn(leg, imu),
         correlation_time=config.gnss.correlation_time,
         rate_b=mean_rates_at(t, leg.t_imu, leg.w_b), angle_covariances=imu.angle_covariances(),
+        brief_accelerations=brief_accelerations(imu),
         drift_time=drift_time(leg, t), min_fix_sigma=MIN_POSE_NOISE if is_pose else MIN_FIX_NOISE)
     for kind in FACTORS:
         if kind.is_present(problem):

@@ -39,6 +39,7 @@ class Problem:
     total_turn: float        # rad, sum of the angles of all turns
     correlation_time: float  # s, gnss.correlation_time: 0 white fix errors, NaN estimated
     rate_b: np.ndarray       # (N, 3) rad/s in b, measured turn rate at the keyframes
+    brief_accelerations: np.ndarray  # (N, 3) m/s^2 in b, at keyframes, not in the speeds there
     angle_covariances: np.ndarray    # (K, 3, 3) rad^2, scatter of the attitude in an interval
     drift_time: np.ndarray   # (K,) s, time in which the correlated fix error changes
     min_fix_sigma: float     # m, of the white and of the correlated fix error each

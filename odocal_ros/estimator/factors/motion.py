@@ -67,6 +67,7 @@ class Motion:
         self.state, self.sums, self.fitted = state, intervals, fitted
         self.uses_speed_steps = leg.uses_speed_steps
         self.angle_covariances = problem.angle_covariances
+        self.brief_accelerations = problem.brief_accelerations
         T = self.T = intervals.T[:, None]
         self.C, self.C_end = state.C_nb[:-1], state.C_nb[1:]
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[layout.ODO_ARM]
@@ -198,10 +199,12 @@ class Motion:
 
     def _derivative_by_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
-        # from the estimated speed, whose changes the accelerometer measures better than the
-        # odometer
-        speed = self.axle.wheel_speed / self.state.scale
-        acceleration = np.gradient(speed, self.state.t)
+        # from the estimated speed and the specific force, which have no rounding error; over the
+        # times of the second derivative in ``as_rolled``, as a robot starts within half a second
+        state = self.state
+        speed = self.axle.wheel_speed / state.scale
+        acceleration = np.gradient(speed, state.t) \
+            + self.brief_accelerations @ state.forward / state.scale
         return np.stack([np.diff(speed), -np.diff(acceleration) / 2], -1)
 
     def jacobians(self, n: int) -> tuple[Floats, Floats, Floats]:

@@ -15,12 +15,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, runs
+from odocal_ros.data.arrays import Bools, Floats, running_sum, runs
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, NormalEquations
 from odocal_ros.estimator.factors.axle import Axle, tyre_signals_at
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import PointRows
+from odocal_ros.estimator.imu import ImuSteps
 from odocal_ros.estimator.levels import LevelRightHandSides, Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import E, ODO_CLOCK, ODO_DELAY, ODO_LAG2
@@ -28,6 +29,7 @@ from odocal_ros.nav.coarse_speed import SpeedInstants
 from odocal_ros.nav.dead_reckoning import gravity_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rotate
+from odocal_ros.nav.time_series import interpolated
 
 # s to each side of a time, judgement: for the mean speed at it, some readings of an odometer
 SPEED_WINDOW = 0.4
@@ -75,6 +77,22 @@ def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
             for weight, step in zip(weights.tolist(), STENCIL.tolist(), strict=True))
         return out
     return rolled
+
+
+def brief_accelerations(imu: ImuSteps) -> Floats:
+    """
+    Return the accelerations at the keyframes that the speeds there do not show: (N, 3) m/s^2, b.
+
+    They are the mean specific force as STENCIL weighs it, minus that between the keyframes before
+    and after. Gravity and bias cancel.
+    """
+    t, force = imu.t_keyframes, imu.signals[:, 3:]
+    speed = running_sum(force - np.diff(imu.t)[:, None] * force.sum(axis=0) / np.ptp(imu.t))
+    path = running_sum((speed[1:] + speed[:-1]) / 2 * np.diff(imu.t)[:, None])
+    middle = np.clip(t, t[0] + STENCIL_REACH, max(t[-1] - STENCIL_REACH, t[0] + STENCIL_REACH))
+    seen = sum(weight * interpolated(middle + step, imu.t, path) for weight, step in zip(
+        SECOND_DERIVATIVE.tolist(), STENCIL.tolist(), strict=True))
+    return np.asarray(seen - np.gradient(speed[imu.keyframes], t, axis=0))
 
 
 class TravelError(Factor):
