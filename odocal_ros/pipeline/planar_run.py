@@ -16,7 +16,7 @@ from odocal_ros.calib.result import failure, LegResult, MethodResult, raise_on_o
 from odocal_ros.data.arrays import Floats, Ints, running_sum
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
-from odocal_ros.nav.time_series import integral_at
+from odocal_ros.nav.time_series import integral_at, robust_sigma
 from odocal_ros.pipeline.methods import leg_result
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason
@@ -130,14 +130,16 @@ def shortened_by_slopes(inputs: Inputs) -> float:
         return 0.0
     geodetic = inputs.geodetic[has_height]
     position = median_origin(inputs.t_fix[has_height], geodetic).to_n(geodetic)
-    variance = np.median(np.einsum('kii->ki', inputs.covariance_n[has_height]), axis=0)
+    # of the heights: stated, or white noise, whose third differences have 20 times its variance
+    variance = max(float(np.median(inputs.covariance_n[has_height, 2, 2])),
+                   robust_sigma(np.diff(position[:, 2], 3))**2 / 20)
     path = running_sum(np.hypot(*np.diff(position[:, :2], axis=0).T))
-    length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance[2])))
+    length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance)))
     ends = np.searchsorted(path[:-1], np.arange(0.0, path[-1], length))
     chord = np.hypot(*np.diff(position[ends, :2], axis=0).T)
     straight = chord > length / 2      # judgement: otherwise it turned back, or is noise
     slope = np.diff(position[ends, 2])[straight] / chord[straight]
-    noise = 2 * variance[2] / np.maximum(chord[straight], 1e-9)**2
+    noise = 2 * variance / np.maximum(chord[straight], 1e-9)**2
     return float(max(np.mean(slope**2 - noise), 0.0) / 2) if straight.any() else 0.0
 
 

@@ -90,18 +90,19 @@ class Value(NamedTuple):
 
     value: float
     effects: Floats      # (m,) of independent unit errors of the constants
-    model_sigma: float   # by the assumed dependence of the width on the radius, or by slopes
+    law: float           # 1 sigma by the assumed dependence of the width on the radius
+    slopes: float        # 1 sigma by slopes, which shorten all lengths
 
     @property
     def sigma(self) -> float:
         """Return the sigma of the value."""
-        return float(np.hypot(np.linalg.norm(self.effects), self.model_sigma))
+        return float(np.linalg.norm([*self.effects, self.law, self.slopes]))
 
 
 def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
                        slopes: float = 0.0) -> MethodResult:
     """Return the result of a fit; unit, nominal: of the scale factor."""
-    # slopes : relative shortening of the path, by which the scale may be wrong
+    # slopes : relative shortening of the path, by which scales and widths may be wrong
     quantities = _select_quantities(fit.names, config)
     values = _compute_values(fit, quantities, slopes)
     estimates, reasons = unknown_values(unit), _fit_reasons(fit)
@@ -121,7 +122,7 @@ def make_planar_result(fit: Fit, unit: str, nominal: float, config: Config,
     if scale.value and slopes > np.linalg.norm(values['scale_factor'].effects / scale.value):
         reasons.append(Reason(
             Code.MODEL_MISMATCH, f'the ground is not level: slopes shorten the path by '
-            f'{100 * slopes:.2g} %, which is added to the uncertainty of the scale',
+            f'{100 * slopes:.2g} %, which is added to the uncertainties',
             'Drive on level ground, or record an IMU.'))
     if scale.value is not None and scale.sigma is not None and nominal:
         estimates['scale_ratio'] = Estimate(scale.value / nominal, scale.sigma / nominal, '1')
@@ -138,9 +139,9 @@ def _compute_values(fit: Fit, quantities: dict[str, Quantity], slopes: float) ->
     values = {}
     for name, quantity in quantities.items():
         value = quantity.value(constants)
-        model_sigma = slopes * value if 'scale' in name else WIDTH_LAW_SHARE * abs(
-            value - 1 / constants['inverse_track_width']) * (quantity.constant == 'arc')
-        values[name] = Value(value, _gradient(quantity, fit) @ root, model_sigma)
+        law = WIDTH_LAW_SHARE * abs(value - 1 / constants['inverse_track_width']) * (
+            quantity.constant == 'arc')
+        values[name] = Value(value, _gradient(quantity, fit) @ root, law, slopes * value)
     return values
 
 
@@ -152,8 +153,8 @@ def _error_sources(values: dict[str, Value], estimates: dict[str, Estimate]) -> 
                 for name, quantity in values.items()}
     sources = [Source(FIT_SOURCE, np.array([
         quantity.effects / divisors[name] for name, quantity in values.items()]))]
-    for source, is_of_scales in ((LAW_SOURCE, False), (SLOPES, True)):
-        sigmas = [quantity.model_sigma / divisors[name] * (('scale' in name) == is_of_scales)
+    for source in (LAW_SOURCE, SLOPES):
+        sigmas = [(quantity.law if source == LAW_SOURCE else quantity.slopes) / divisors[name]
                   for name, quantity in values.items()]
         if any(sigmas):
             sources.append(Source(source, np.array(sigmas)[:, None], True))
