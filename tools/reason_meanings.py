@@ -21,7 +21,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'a wrong type, or a driver that is not running.',
         Code.NO_FIX: 'There is no position between the marks, or none near one of the two marks.',
         Code.FIXES_UNUSABLE: 'There are fixes, but each one has no position, a status below '
-        '`gnss.min_status`, or a sigma above `gnss.max_sigma`.',
+        '`gnss.min_status`, or a sigma above `gnss.max_sigma`. Or the positions of a local frame '
+        'are map coordinates, are not in metres, or do not have z up.',
         Code.BAD_ROWS_DROPPED: 'Some messages have no stamp, hold NaN or an impossible value, '
         'are isolated outliers, or are fixes far from all others. They were left out. A leg '
         'counts its messages and those of its pre-roll (`leg.preroll`); odocal inspect counts '

@@ -20,7 +20,8 @@ from odocal_ros.nav.time_series import integral_at, robust_sigma
 from odocal_ros.pipeline.methods import leg_result
 from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.inputs import Inputs, median_origin
+from odocal_ros.screening.inputs import Inputs, locate_fixes, median_origin
+from odocal_ros.screening.local_frame import local_frame_reasons
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings import config as settings
 from odocal_ros.settings.nominal import grade_of, nominal_scale
@@ -94,6 +95,8 @@ def _make_run(inputs: Inputs, config: settings.Config) -> tuple[planar.Run | Non
     if len(inside) < MIN_POSITIONS:
         return None, [Reason(Code.NO_FIX, f'{len(inside)} positions while the wheels have data; '
                              f'required: {MIN_POSITIONS}')]
+    if frame_reasons := local_frame_reasons(inputs, locate_fixes(inputs, config), kind):
+        return None, [*frame_reasons]
     nodes = _make_nodes(inputs.t_fix[inside])
     t, rows = nodes.t, inside[nodes.rows]
     geodetic = np.nan_to_num(inputs.geodetic[rows])

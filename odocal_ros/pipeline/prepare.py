@@ -25,8 +25,9 @@ from odocal_ros.screening import imu_orientation
 from odocal_ros.screening.axles import pair_wheels
 from odocal_ros.screening.imu_faults import forward_turn_reasons
 from odocal_ros.screening.inputs import Inputs, locate_fixes, LocatedFixes
+from odocal_ros.screening.local_frame import local_frame_reasons
 from odocal_ros.screening.row_screen import imu_gap
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, DIFFERENTIAL
 
 SCALE_LIMIT_CODES = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # of limits in metres
 WHEEL_FAULT_CODES = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
@@ -109,7 +110,7 @@ def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:
 
 def _missing_drive_reasons(inputs: Inputs, located: LocatedFixes) -> tuple[Reason, ...] | None:
     """Return the reasons why there is no usable drive, None if there is one."""
-    refusal_reasons = drive.motion_reasons(
+    refusal_reasons = local_frame_reasons(inputs, located, DIFFERENTIAL) or drive.motion_reasons(
         inputs.travel, inputs.t_fix, located.fixes_n, located.fix_sigma, inputs.t_stop,
         inputs.min_motion)
     if refusal_reasons:
