@@ -17,9 +17,10 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason, SEVERITY, Verdict, verdict_of
 
 # keys of a result in calibration.json that are not estimates
-NOT_ESTIMATES = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time', 'scale_by_curvature',
-                           'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
-                           'pitch_mounting_angle_housing_sigma'})
+NOT_ESTIMATES = frozenset({
+    'imu_rotation', 'scale_by_speed', 'scale_by_time', 'scale_by_left_force', 'scale_by_curvature',
+    'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
+    'pitch_mounting_angle_housing_sigma'})
 RAW_SCALE = 'scale_factor_as_sent'     # of a quantised speed as published
 WHEEL_PREFIX = 'scale_factor_'     # format: before the name of a wheel
 TRACE = 'trace'      # format: key in the details of a method that raised an exception: traceback

@@ -182,8 +182,8 @@ class JointMarginals:
         by_constants = self._corner @ J_constants
         if J_next is not None:
             by_block += 2 * (cross[:, :, :n][:, :, next_columns] @ J_next)
-            by_next = self._diagonal[rows + 1][:, next_columns, next_columns] @ J_next
-            by_next += 2 * (self._cross[rows + 1][:, next_columns, n:] @ J_constants)
+            by_next = self._diagonal[rows + 1, next_columns, next_columns] @ J_next
+            by_next += 2 * (self._cross[rows + 1, next_columns, n:] @ J_constants)
         out: Floats = (J * by_block).sum(axis=1) + (J_constants * by_constants).sum(axis=1)
         return out if J_next is None else out + (J_next * by_next).sum(axis=1)
 
@@ -198,7 +198,7 @@ class JointMarginals:
         cross, after = self._cross[rows], self._cross[ends][:, :, n:]
         begin, end, constants = J[:, :, :n], J[:, :, n:2 * n], J[:, :, 2 * n:]
         by_begin = begin @ self._diagonal[rows] + 2 * (end @ np.swapaxes(cross[:, :, :n], 1, 2))
-        by_constants = constants @ self._corner + 2 * (begin @ cross[:, :, n:] + end @ after)
+        by_constants = 2 * (begin @ cross[:, :, n:] + end @ after) + constants @ self._corner
         out: Floats = by_begin @ np.swapaxes(begin, 1, 2)
         out += by_constants @ np.swapaxes(constants, 1, 2)
         out += end @ self._diagonal[ends] @ np.swapaxes(end, 1, 2)

@@ -148,6 +148,7 @@ def imperfection_sigmas(grade: Grade) -> Floats:
         'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
         'scale_by_time': 2.5e-3 / WARM_TIME,        # 1 / s
         'scale_by_force': 4e-3,                     # 1 / (m/s^2)
+        'scale_by_left_force': 5e-4,                # 1 / (m/s^2)
         # m^2: a car's front axle has -7, the mean of its four wheels -4
         'scale_by_curvature': 4.0,
         'scale_by_pitching': 1.0,                   # per half the squared angle

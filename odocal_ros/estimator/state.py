@@ -56,7 +56,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'fix_lag_square', 'fix_error_by_motion', 'gnss_clock_rate', 'odometer_clock_rate',
              'odometer_lag_square',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
-             'scale_by_curvature', 'scale_by_pitching',
+             'scale_by_left_force', 'scale_by_curvature', 'scale_by_pitching',
              'squat', 'dive', 'squat_by_jerk', 'sideslip', 'sideslip_by_jerk',
              'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns',
              'body_centre_height', 'sway_by_force', 'lift_by_turning', 'mean_roll',
@@ -97,11 +97,12 @@ ODO_LAG2 = CONSTANTS.index('odometer_lag_square')
 FIX_BY_MOTION, FIX_MOTION_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_motion_time'))
 # relative change of the scale from its mean over the path, (S11): with the square of the speed
 # (its slope at FAST_SPEED, s/m), with time as tyres warm (its rate at the start of the leg, 1/s),
-# with traction and braking, 1/(m/s^2): a wheel that is not driven only brakes; and with half the
-# squared curvature, m^2: -x^2 of a steered wheel at x ahead, -x^2 / 2 of the mean of four wheels
+# with traction and braking, 1/(m/s^2): a wheel that is not driven only brakes; with the force to
+# the left, of one wheel that turns load or relieve; and with half the squared curvature, m^2:
+# -x^2 of a steered wheel at x ahead, -x^2 / 2 of the mean of four wheels
 TYRES = constants_from('scale_by_speed', 'scale_by_curvature')
-SCALE_BY_SPEED, SCALE_BY_TIME, SCALE_BY_CURVATURE = map(CONSTANTS.index, (
-    'scale_by_speed', 'scale_by_time', 'scale_by_curvature'))
+SCALE_BY_SPEED, SCALE_BY_TIME, SCALE_BY_LEFT_FORCE, SCALE_BY_CURVATURE = map(CONSTANTS.index, (
+    'scale_by_speed', 'scale_by_time', 'scale_by_left_force', 'scale_by_curvature'))
 FAST_SPEED = 20.0           # m/s, definition: at which the slope is stated, a country road
 # relative change of the path per half the mean square of the body pitch in an interval, (S11a): 1
 # if the axle keeps its direction, 0 if it follows the body, negative if bumps are shorter than the
@@ -134,9 +135,10 @@ KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'acceleromete
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
               'clock_rate': 2, 'odometer_lag_square': 1,
               'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2,
-              'scale_by_curvature': 1, 'scale_by_pitching': 1, 'squat': 2, 'squat_by_jerk': 1,
-              'sideslip': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 2, 'pitch_centre_in_turns': 1,
-              'body_centre_height': 1, 'sway_by_force': 1}
+              'scale_by_left_force': 1, 'scale_by_curvature': 1, 'scale_by_pitching': 1,
+              'squat': 2, 'squat_by_jerk': 1, 'sideslip': 1, 'sideslip_by_jerk': 1,
+              'pitch_centre': 2, 'pitch_centre_in_turns': 1, 'body_centre_height': 1,
+              'sway_by_force': 1}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECTIONS
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')

@@ -60,15 +60,16 @@ def moved():
     rng = np.random.default_rng(1)
     step = 1e-3 * rng.standard_normal((len(state.t), N))
     step[:, layout.PHI.start:layout.BG.stop] *= 0.1
-    c = 1e-3 * np.insert(rng.standard_normal(layout.M - 8), [
-        layout.FIX_MOTION_TIME, layout.SCALE_BY_CURVATURE - 1, layout.PITCH_LEAN.start - 1,
-        *2 * [layout.BODY_TILT.start], *3 * [layout.FIX_ERROR_BY_SIGMA.start - 5]], 1.0)
+    c = 1e-3 * np.insert(rng.standard_normal(layout.M - 9), [
+        layout.FIX_MOTION_TIME, *2 * [layout.SCALE_BY_LEFT_FORCE - 1],
+        layout.PITCH_LEAN.start - 2, *2 * [layout.BODY_TILT.start - 1],
+        *3 * [layout.FIX_ERROR_BY_SIGMA.start - 6]], 1.0)
     # derivatives by biases treat these as constant within hills: no bump centre or body
     # centre of real size, because derivatives neglect how they change the effect of the others
     c[layout.SPEED_OFFSET], c[layout.FIX_MOTION_TIME], c[layout.LIFT] = 0.0, np.log(5.0), 0.01
     c[layout.MEAN_ROLL] = 0.01
     c[layout.IMPERFECTIONS] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03,
-                                0.003, 0.0, 0.0, 10.0, 1e3, *[0.0] * 5, 1e3, 0.0, 1e3, 0.0, 0.0]
+                                0.003, *[0.0] * 3, 10.0, 1e3, *[0.0] * 5, 1e3, 0.0, 1e3, 0.0, 0.0]
     c[layout.FIX_LAG2] = 2.1e-4    # not zero, where the filter changes its type
     c[layout.VELOCITY_LAG2] = 2.1e-4
     return problem, state.updated(step, c)

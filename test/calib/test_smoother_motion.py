@@ -12,7 +12,7 @@ from smoother_legs import along_axis, at_truth, made, pitch_increments, truth
 
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import Equations, preintegrate_at as preintegrated
-from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
+from odocal_ros.estimator.factors.axle import Axle, mean_square, WALK_SPEED
 from odocal_ros.estimator.factors.motion import Motion
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.factors.pseudo_observations import STILL_TURN
@@ -111,6 +111,12 @@ def test_tyres_and_springs_depend_on_the_axle_acceleration_for_any_imu_position(
     limit = 2 * 0.9 * change * 0.05 / 4
     assert np.abs(elsewhere - at_axle).max() < limit
     assert np.abs(along_elsewhere - along).max() < limit
+
+
+def test_mean_square_of_a_parabola_equals_its_integral():
+    parabola = np.polynomial.Polynomial([0.3, -1.1, 2.4])      # on an interval from 0 to 1
+    mean, square = (p.integ()(1.0) for p in (parabola, parabola**2))
+    assert mean_square(parabola(0.0), parabola(1.0), mean) == pytest.approx(square, rel=1e-12)
 
 
 def test_turn_rate_noise_is_not_a_side_force():

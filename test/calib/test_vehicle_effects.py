@@ -16,6 +16,7 @@ from odocal_ros.estimator import smooth
 from odocal_ros.estimator.level_steps import long_span_factors
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.state import CONSTANTS, FIX_ERROR_BY_SIGMA, HEIGHT_DRIFT
+from odocal_ros.nav.time_series import running_integral
 from odocal_ros.reasons import Code
 from odocal_ros.settings.nominal import G
 from odocal_ros.sim.noise import gauss_markov
@@ -27,6 +28,7 @@ from odocal_ros.sim.wheels import steered_path
 pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 250.0, 'imu_grade': 'industrial', 'sway': 0.05}
 AHEAD = 6.0      # m
+RTK = TOWN | {'fix_noise': 'rtk', 'fix_sigma': 0.01}
 
 
 def test_scale_that_decreases_with_speed_is_not_attributed_to_tyres():
@@ -62,21 +64,47 @@ def test_brakes_pitch_the_body_with_a_slope_of_their_own():
         assert abs(value['value'] + true) < 3.0 * value['sigma'] < dive / 2
 
 
+def rolled_differently(leg, drive, additional):
+    """Return the leg with additional travel, m, a function of the motion, and its share."""
+    since = (drive.truth.start_ns - drive.options.start_ns) * 1e-9
+    travel, scale = leg.travel, drive.truth.scale
+    more = additional(drive.motion.at(since + travel.t)) / scale
+    within = (travel.t >= leg.t_begin) & (travel.t <= leg.t_stop)
+    rolled, size = (np.abs(np.diff(x[within])).sum() for x in (travel.s, more))
+    return replace(leg, travel=replace(travel, s=travel.s + more)), size / rolled
+
+
+@pytest.mark.parametrize('seed', [4, 5])
+def test_turns_load_or_relieve_a_wheel(seed):
+    """The tyre of an odometer on one wheel is larger in turns to its own side."""
+    drive, config, leg = made(**RTK | {'seed': seed})
+    by_force = 1e-3     # per m/s^2
+
+    def additional(state):
+        return -by_force * running_integral(state.t, state.speed**2 * state.yaw_rate)
+
+    loaded, share = rolled_differently(leg, drive, additional)
+    found = smooth(loaded, config)
+    assert share > 1e-4
+    assert off(found, drive) < 3.0
+    assert found.estimates['scale_factor'].sigma < 1.1 * smooth(
+        leg, config).estimates['scale_factor'].sigma
+    slope = found.details['beside']['scale_by_left_force']
+    assert abs(slope['slope'] - by_force) < 3.0 * slope['sigma'] < by_force
+    assert 'from right to left turns' in reason_texts(found)[Code.SCALE_VARIES]
+    assert Code.WHEEL_SLIP not in reason_texts(found)
+
+
 @pytest.mark.parametrize(('share', 'seed'), [(1.0, 4), (0.5, 5)])
 def test_wheels_that_steer_travel_farther_in_turns(share, seed):
     """Front wheels of a bus, 6 m ahead, and the mean of all four."""
-    drive, config, leg = made(**TOWN | {'fix_noise': 'rtk', 'fix_sigma': 0.01, 'seed': seed})
-    since = (drive.truth.start_ns - drive.options.start_ns) * 1e-9
-    travel, scale = leg.travel, drive.truth.scale
-    additional = share * steered_path(drive.motion.at(since + travel.t), (AHEAD, 0.0, 0.0)) / scale
-    steered = replace(leg, travel=replace(travel, s=travel.s + additional))
+    drive, config, leg = made(**RTK | {'seed': seed})
+    steered, more = rolled_differently(leg, drive, lambda state: share * steered_path(
+        state, (AHEAD, 0.0, 0.0)))
     found = smooth(steered, config)
-    within = (travel.t >= leg.t_begin) & (travel.t <= leg.t_stop)
-    rolled, more = (np.ptp(np.abs(x[within])) for x in (travel.s, additional))
-    assert more / rolled > 1e-4
-    estimate = found.estimates['scale_factor']
+    assert more > 1e-4
     assert off(found, drive) < 3.0
-    assert estimate.sigma < 0.3 * more / rolled * scale
+    assert found.estimates['scale_factor'].sigma < 0.3 * more * drive.truth.scale
     slope = found.details['beside']['scale_by_curvature']
     assert abs(slope['slope'] + share * AHEAD**2) < 3.0 * slope['sigma'] < 0.3 * share * AHEAD**2
     assert 'to the tightest turn' in reason_texts(found)[Code.SCALE_VARIES]

@@ -18,7 +18,7 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
     FAST_SPEED,
     ODO_ARM,
-    SCALE_BY_CURVATURE,
+    SCALE_BY_LEFT_FORCE,
     State,
     TYRES,
 )
@@ -67,12 +67,19 @@ def separate_tilts(tilt: Floats, acceleration: Floats, path: Floats) -> tuple[Fl
     return ground, at_rest + by_force * acceleration - ground
 
 
+def mean_square(begin: Floats, end: Floats, mean: Floats) -> Floats:
+    """Return means of the squares of parabolas with these values at the ends, and this mean."""
+    both = begin + end
+    middle = 6 * mean - 3 * both
+    return (both**2 - begin * end) / 3 + middle * both / 6 + middle**2 / 30
+
+
 class Axle:
     """
     Motion of the origin of base_link, where the axle does not slip sideways, at a state.
 
-    At the keyframes: v_n, (N, 3) m/s, its velocity; left_acceleration, (N,) m/s^2; wheel_speed,
-    (N,) m/s, forward, at the odometer.
+    At the keyframes: v_n, (N, 3) m/s, its velocity; turn_rate, (N,) rad/s; left_acceleration,
+    (N,) m/s^2; wheel_speed, (N,) m/s, forward, at the odometer.
     """
 
     def __init__(self, problem: Problem, state: State) -> None:
@@ -87,7 +94,8 @@ class Axle:
         self.v_n = velocity_at(arm)
         # at the keyframe, as the roll: a mean of the intervals beside it precedes and follows a
         # turn by a second, and the difference would be a bank (decisions/0009)
-        self.left_acceleration = self._forward_speed(self.v_n) * (rate @ state.C_bv[:, 2])
+        self.turn_rate: Floats = rate @ state.C_bv[:, 2]
+        self.left_acceleration = self._forward_speed(self.v_n) * self.turn_rate
         self.wheel_speed = self._forward_speed(velocity_at(arm + leg.odometer_arm))
 
     def _forward_speed(self, v_n: Floats) -> Floats:
@@ -126,11 +134,7 @@ class Axle:
         They include the components of gravity along a slope and a bank.
         """
         T, speed = np.diff(self.state.t), self._forward_speed(self.v_n)
-        # by speed and turn rate: a velocity difference of the axle has the noise of two turn rates
-        # times its distance from the IMU, which reduces the estimated sideslip (decisions/0009)
-        left = (speed[1:] + speed[:-1]) / 2 * (mean_rate @ self.state.C_bv[:, 2])
-        bank, _ = self.rolls()
-        left += G * (bank[1:] + bank[:-1]) / 2
+        left = self.left_force(mean_rate)
         forward = np.diff(speed) / T + G * self._slope()
         # the suspension of an axle reacts differently to its drive and to its brakes
         traction = np.where(forward * (speed[1:] + speed[:-1]) > 0, forward, 0.0)
@@ -138,6 +142,14 @@ class Axle:
                                    for x in (forward, left))
         return (np.stack([traction, forward - traction, forward_jerk], -1),
                 np.stack([left, left_jerk], -1))
+
+    def left_force(self, mean_rate: Floats) -> Floats:
+        """Return the acceleration to the left and that of gravity on a bank: (K,) m/s^2."""
+        # by speed and turn rate: a velocity difference of the axle has the noise of two turn rates
+        # times its distance from the IMU, which reduces the estimated sideslip (decisions/0009)
+        speed, (bank, _) = self._forward_speed(self.v_n), self.rolls()
+        turning = (speed[1:] + speed[:-1]) / 2 * (mean_rate @ self.state.C_bv[:, 2])
+        return turning + G * (bank[1:] + bank[:-1]) / 2
 
     def traction_acceleration(self) -> Floats:
         """Return the acceleration due to traction (positive) and braking, (S11): (K,) m/s^2."""
@@ -147,25 +159,27 @@ class Axle:
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + by_slope
 
     def tyre_signals(self, sums: Intervals) -> tuple[Floats, Floats]:
-        """Return the signals of TYRES in each interval, (K, 5), and where K is stated, (5,)."""
+        """Return the signals of TYRES in each interval, (K, 6), and where K is stated, (6,)."""
         state = self.state
         path = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
         signals = tyre_signals_at(path / sums.T, t - state.t[0], self.traction_acceleration(),
-                                  sums.mean_rate @ state.C_bv[:, 2])
+                                  self.left_force(sums.mean_rate), mean_square(
+                                      self.turn_rate[:-1], self.turn_rate[1:],
+                                      sums.mean_rate @ state.C_bv[:, 2]))
         # K is that of the mean speed, time and force, but of straight travel: few drives have the
         # same turns
         reference = path / max(path.sum(), 1e-9) @ signals
-        reference[SCALE_BY_CURVATURE - TYRES.start] = 0.0
+        reference[SCALE_BY_LEFT_FORCE - TYRES.start:] = 0.0
         return signals, reference
 
 
 def tyre_signals_at(speed: Floats, t: Floats, acceleration_along: Floats,
-                    turn_rate: Floats) -> Floats:
-    """Return the signals of TYRES, x of (S11): (..., 5); t : s since the start of the leg."""
+                    left_force: Floats, squared_turn_rate: Floats) -> Floats:
+    """Return the signals of TYRES, x of (S11): (..., 6); t : s since the start of the leg."""
     # m/s^2, 1/m: acceleration that rolling and air resistance take from a car at constant speed
     force = acceleration_along + 0.1 + 1e-4 * speed**2
     warm = WARM_TIME * (1 - np.exp(-t / WARM_TIME))
+    curvature = squared_turn_rate / np.maximum(speed**2, WALK_SPEED**2)
     return np.stack([speed**2 / (2 * FAST_SPEED), warm, np.maximum(force, 0.0),
-                     np.minimum(force, 0.0),
-                     turn_rate**2 / (2 * np.maximum(speed**2, WALK_SPEED**2))], -1)
+                     np.minimum(force, 0.0), left_force, curvature / 2], -1)

@@ -114,22 +114,25 @@ class MotionRows(Factor):
         return out
 
     def add(self, out: NormalEquations) -> None:
-        n = self.n
         for rows in blocks(len(self.r)):
-            ends, J = slice(rows.start + 1, rows.stop + 1), self.J[rows]
-            J_T = np.swapaxes(J, 1, 2)
-            begin, end = J_T[:, :n] @ J, J_T[:, n:2 * n] @ J[:, :, n:]
-            by_constants = np.ascontiguousarray(J[:, :, 2 * n:]).reshape(-1, self.m)
-            g = -np.einsum('kij,ki->kj', J, self.r[rows])
-            out.diagonal[rows] += begin[:, :, :n]
-            out.diagonal[ends] += end[:, :, :n]
-            out.upper[rows] += begin[:, :, n:2 * n]
-            out.coupling[rows] += begin[:, :, 2 * n:]
-            out.coupling[ends] += end[:, :, n:]
-            out.corner += by_constants.T @ by_constants
-            out.g[rows] += g[:, :n]
-            out.g[ends] += g[:, n:2 * n]
-            out.g_constants += g[:, 2 * n:].sum(axis=0)
+            self._add_block(out, rows)
+
+    def _add_block(self, out: NormalEquations, rows: slice) -> None:
+        """Add the rows of some intervals; its arrays are freed before those of the next ones."""
+        n, ends, J = self.n, slice(rows.start + 1, rows.stop + 1), self.J[rows]
+        J_T = np.swapaxes(J, 1, 2)
+        begin, end = J_T[:, :n] @ J, J_T[:, n:2 * n] @ J[:, :, n:]
+        by_constants = np.ascontiguousarray(J[:, :, 2 * n:]).reshape(-1, self.m)
+        g = -np.einsum('kij,ki->kj', J, self.r[rows])
+        out.diagonal[rows] += begin[:, :, :n]
+        out.diagonal[ends] += end[:, :, :n]
+        out.upper[rows] += begin[:, :, n:2 * n]
+        out.coupling[rows] += begin[:, :, 2 * n:]
+        out.coupling[ends] += end[:, :, n:]
+        out.corner += by_constants.T @ by_constants
+        out.g[rows] += g[:, :n]
+        out.g[ends] += g[:, n:2 * n]
+        out.g_constants += g[:, 2 * n:].sum(axis=0)
 
     def cost(self) -> float:
         return float((self.r**2).sum())

@@ -186,9 +186,10 @@ class SpeedSteps(PointRows):
         c = state.constants
         axle = Axle(problem, state)
         _, reference = axle.tyre_signals(point.intervals)
+        along, left = axle.traction_acceleration(), axle.left_force(point.intervals.mean_rate)
         self.tyre_signals = tyre_signals_at(
-            self.speed, state.t[self.k] - state.t[0] + points.tau,
-            axle.traction_acceleration()[self.k], points.rate @ state.C_bv[:, 2]) - reference
+            self.speed, state.t[self.k] - state.t[0] + points.tau, along[self.k], left[self.k],
+            (points.rate @ state.C_bv[:, 2])**2) - reference
         self.scale_ratio = 1 + self.tyre_signals @ c[layout.TYRES]
         speed_by_wheel = self.instants.value + self.instants.sign * c[layout.SPEED_OFFSET]
         speed_by_wheel *= state.scale * self.scale_ratio

@@ -12,7 +12,7 @@ new sensor is one subclass of it, listed in ``equations.FACTORS``.
 """
 
 from collections.abc import Callable, Iterator
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -74,7 +74,7 @@ class PointRows(Factor):
         return True
 
     def weigh(self, levels: Levels) -> None:
-        """Compute r and J_end with the weights of outliers."""
+        """Compute r, the whitened derivatives J, (m, d, n + M), and J_end, weighted."""
         white = self.whiten(self.raw[:, :, None])[:, :, 0]
         factor = np.ones(white.shape[1])
         for level, columns in self.level_columns.items():
@@ -83,24 +83,19 @@ class PointRows(Factor):
         self.weight = self._weights(white)
         root_weight = np.sqrt(self.weight / self.rows_per_independent)
         self.r = root_weight * white
-        self._root = (root_weight * factor)[:, :, None]
+        root = (root_weight * factor)[:, :, None]
+        by_keyframe, by_constants = self.jacobians(self.n)
+        self.J = work_array(*self.raw.shape, self.n + self.m)
+        for rows in blocks(len(self.J)):
+            self.J[rows, :, :self.n] = self.whiten(by_keyframe[rows], rows)
+            self.J[rows, :, self.n:] = self.whiten(by_constants[rows, :, :self.m], rows)
+            self.J[rows] *= root[rows]
         self.J_end = None
         if self.n == SIZE_WITH_SLOW and self.share is not None:
             identity = np.broadcast_to(np.eye(3), (len(white), 3, 3))
-            self.J_end = -self.whiten(identity) * self._root * self.share[:, None, None]
+            self.J_end = -self.whiten(identity) * root * self.share[:, None, None]
         logs = np.log(np.tile(factor, (len(white), 1)))
         self.log_R = -2 * logs.sum() / self.rows_per_independent
-
-    @cached_property
-    def J(self) -> Floats:
-        """Return the whitened derivatives: (m, d, n + M)."""
-        by_keyframe, by_constants = self.jacobians(self.n)
-        out = work_array(*self.raw.shape, self.n + self.m)
-        for rows in blocks(len(out)):
-            out[rows, :, :self.n] = self.whiten(by_keyframe[rows], rows)
-            out[rows, :, self.n:] = self.whiten(by_constants[rows, :, :self.m], rows)
-            out[rows] *= self._root[rows]
-        return out
 
     def _norms(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
         """Yield the components of each level, and the norms of their residuals, in sigmas."""

@@ -110,6 +110,7 @@ def additional_figures(value: Floats, covariance: Floats, grade: Grade | None) -
     out: dict[str, Any] = {
         layout.CONSTANTS[i]: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
         for i, unit in ((layout.SCALE_BY_SPEED, '1/(m/s)'), (layout.SCALE_BY_TIME, '1/s'),
+                        (layout.SCALE_BY_LEFT_FORCE, '1/(m/s^2)'),
                         (layout.SCALE_BY_CURVATURE, 'm^2'))}
     if grade is not None:
         for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):

@@ -166,6 +166,7 @@ def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     for i, interval, remedy in (
             (layout.SCALE_BY_SPEED, 'from low to high speed', SPEED_SCALE_REMEDY),
             (layout.SCALE_BY_TIME, 'from start to end', ''),
+            (layout.SCALE_BY_LEFT_FORCE, 'from right to left turns', ''),
             (layout.SCALE_BY_CURVATURE, 'from straight travel to the tightest turn',
              STEERED_REMEDY)):
         signal = motion.tyre_signals[:, i - layout.TYRES.start]
