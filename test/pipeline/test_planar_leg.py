@@ -80,7 +80,9 @@ def test_swapped_wheels_are_rejected():
     leg = replace(leg, odometer=leg.odometer_right, odometer_right=leg.odometer)
     found = calibrate(leg, config)
     assert found.verdict is Verdict.REJECTED
-    assert Code.WHEELS_SWAPPED in {r.code for r in found.methods['planar'].reasons}
+    codes = {r.code for r in found.methods['planar'].reasons}
+    assert Code.WHEELS_SWAPPED in codes
+    assert not codes & {Code.MODEL_MISMATCH, Code.NOT_CONVERGED}     # its consequences
 
 
 def test_a_run_without_turns_has_a_scale_and_no_width():

@@ -168,14 +168,14 @@ def refused_planar_result(reasons: Iterable[Reason], unit: str) -> MethodResult:
 
 def _fit_reasons(fit: Fit) -> list[Reason]:
     """Return the reasons against a fit as a whole."""
+    if fit.swapped:      # the cause of the others
+        return [Reason(Code.WHEELS_SWAPPED, 'the mirrored positions fit the wheels better: '
+                       'left and right wheels are swapped')]
     reasons = [] if fit.converged else [Reason(
         Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} iterations; '
         'its uncertainties were doubled',
         'Check odometer.wheels, odometer.drive, odometer.time_offset and gnss.time_offset, and '
         'drive left and right turns.')]
-    if fit.swapped:
-        reasons.append(Reason(Code.WHEELS_SWAPPED, 'the mirrored positions fit the wheels better: '
-                              'left and right wheels are swapped'))
     noisy = max(WHEEL_NOISE, key=lambda name: fit.levels[name])
     if fit.levels[noisy] > NOISE_LIMIT:
         reasons.append(Reason(
