@@ -19,7 +19,7 @@ ZOO = [    # kind, grade, verdict, errors of NAMES over their sigmas
     ('town', 'consumer', 'caution', (-0.82, -0.15, 0.75)),
     ('straight', 'industrial', 'caution', (-0.23, 0.21, None)),
     ('out_and_back', 'tactical', 'accepted', (-0.69, 0.2, 0.24)),
-    ('motorway', 'consumer', 'accepted', (0.95, -0.2, -0.6)),
+    ('motorway', 'consumer', 'accepted', (0.81, -0.17, -0.56)),
     ('yard', 'industrial', 'caution', (-0.62, -1.24, 0.14)),
     ('town', 'tactical', 'caution', (-0.13, -0.62, 1.83)),
     ('straight', 'consumer', 'accepted', (0.96, 1.09, None)),
