@@ -171,7 +171,7 @@ def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: f
     """
     Return intervals in which fixes move and wheels stand, as on a ferry, (k, 2) s.
 
-    An interval begins when the fixes leave their place at its start, and ends when they reach the
+    An interval begins when the vehicle leaves its place at the start, and ends when it reaches the
     last one: the standstill on either side is not a ferry.
     """
     spans = []
@@ -182,13 +182,19 @@ def ferry_intervals(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: f
         t, positions = t_fix[rows], fixes_n[rows, :2]
         # at most a quarter of the distance: with noisy fixes, both ends remain two places
         limit = min(max(MIN_LOCAL_MOTION, 10 * fix_sigma), distance / 4)
-        # the places are medians of three fixes, of which one may be an outlier
-        is_after_start, is_before_end = (
-            np.hypot(*(positions - np.median(place, axis=0)).T) > limit
-            for place in (positions[:3], positions[-3:]))
-        last = len(t) - 1 - np.argmax(is_before_end[::-1])
-        spans.append((t[np.argmax(is_after_start)], t[last]))
+        left, reached = _start_of_motion(t, positions, limit), -_start_of_motion(
+            -t[::-1], positions[::-1], limit)
+        spans.append((left, reached))
     return np.reshape(np.array(spans, float), (-1, 2))
+
+
+def _start_of_motion(t: Floats, positions: Floats, limit: float) -> float:
+    """Return the time at which the fixes, (k, 2) m at (k,) s, leave their first place, s."""
+    # the place is the median of three fixes, of which one may be an outlier
+    distance = np.hypot(*(positions - np.median(positions[:3], axis=0)).T)
+    near, far = (t[np.argmax(distance > share * limit)] for share in (1.0, 2.25))
+    # at constant acceleration from rest, 2.25 times the distance takes 1.5 times as long
+    return float(max(near - 2 * max(far - near, 0.0), t[0]))
 
 
 def _motion_of_fixes(fixes: Floats, motion_limit: float) -> float:

@@ -9,7 +9,9 @@ from drives import drive, off, seconds, settings, with_columns, without
 import numpy as np
 import pytest
 
+from odocal_ros.calib.drive import ferry_intervals
 from odocal_ros.data.samples import take
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.time_series import gaps_in_rhythm, gaps_longer
 from odocal_ros.pipeline.calibrate import (
     calibrate,
@@ -208,3 +210,17 @@ def test_a_counter_that_stops_for_ever_rejects_the_leg(made):
     dead = replace(leg, odometer=replace(leg.odometer, value=value))
     (only,) = calibrate_parts(dead, settings(made, heading_sigma=None, method='smoother'))
     assert Code.ODOMETER_STILL in {r.code for r in only.reasons}
+
+
+def test_a_ferry_begins_where_a_steady_acceleration_starts_from_rest():
+    """0.02 m/s^2 for 60 s: the first 0.5 m take 7 s and were part of the standstill."""
+    t = np.arange(0.0, 200.0, 0.2)
+    depart, arrive, a = 40.0, 160.0, 0.02
+    half = (arrive - depart) / 2
+    x = a / 2 * np.clip(t - depart, 0.0, half)**2
+    x = np.where(t < depart + half, x, a * half**2 - a / 2 * np.clip(arrive - t, 0.0, half)**2)
+    travel = Travel(np.array([0.0, 1.0, 199.0, 200.0]), np.array([0.0, 9.0, 9.0, 18.0]), 0.0)
+    fixes = np.stack([x, 0 * x, 0 * x], -1) + np.random.default_rng(1).normal(0, 0.01, (len(t), 3))
+    span, = ferry_intervals(travel, t, fixes, 0.012)
+    # three times the difference of two times of fixes, each 0.2 s off at most
+    assert np.abs(span - (depart, arrive)).max() < 1.2
