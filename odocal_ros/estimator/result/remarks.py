@@ -161,7 +161,7 @@ def _outlier_reasons(problem: Problem, fit: Fit) -> list[Reason]:
 
 def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
-    motion, c = fit.weighted[MotionRows].motion, fit.state.constants
+    ranges, c = np.ptp(fit.weighted[MotionRows].motion.tyre_signals, axis=0), fit.state.constants
     texts, remedies = list[str](), list[str]()
     for i, interval, remedy in (
             (layout.SCALE_BY_SPEED, 'from low to high speed', SPEED_SCALE_REMEDY),
@@ -169,14 +169,13 @@ def _scale_variation_reasons(fit: Fit, sigma: Floats) -> list[Reason]:
             (layout.SCALE_BY_LEFT_FORCE, 'from right to left turns', ''),
             (layout.SCALE_BY_CURVATURE, 'from straight travel to the tightest turn',
              STEERED_REMEDY)):
-        signal = motion.tyre_signals[:, i - layout.TYRES.start]
-        change, change_sigma = np.array([c[i], sigma[i]]) * np.ptp(signal)
+        change, change_sigma = np.array([c[i], sigma[i]]) * ranges[i - layout.TYRES.start]
         if abs(change) > max(REMARK_SIGMAS * change_sigma, MIN_REPORTED_CHANGE):
             texts.append(f'{100 * change:+z.2f} ± {100 * change_sigma:.2f} % {interval}')
             remedies += [remedy] if remedy and change < 0 else []
-    return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(texts)}; the stated '
-                   'value is the mean over this leg, for straight travel', ' '.join(remedies))
-            ] if texts else []
+    text = (f'the scale changes by {" and ".join(texts)}; the stated value is the mean over this '
+            'leg, for straight travel')
+    return [Reason(Code.SCALE_VARIES, text, ' '.join(remedies))] if texts else []
 
 
 def _bias_step_reasons(fit: Fit) -> list[Reason]:
@@ -267,12 +266,12 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def contains_odometer(scale_error: float, sigma: float) -> bool:
     """Return True if the positions contain an odometer, with this scale error and its sigma."""
-    min_size = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
-    return bool(abs(scale_error) > max(FAULT_SIGMAS * sigma, min_size))
+    # relative: smaller errors do not change a scale by more than its sigma
+    return bool(abs(scale_error) > max(FAULT_SIGMAS * sigma, 5e-4))
 
 
-def odometer_reasons(scale_error: float, sigma: float, log_time: float,
-                     map_sigma: float) -> tuple[Reason, ...]:
+def odometer_reasons(
+        scale_error: float, sigma: float, log_time: float, map_sigma: float) -> tuple[Reason, ...]:
     """Return FIXES_FOLLOW_ODOMETER if significant; map_sigma : of ln K, 0 without a map."""
     if not contains_odometer(scale_error, sigma):
         return ()
