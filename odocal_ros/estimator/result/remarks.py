@@ -293,8 +293,7 @@ def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def clock_reasons(name: str, rate: float, sigma: float, duration: float) -> tuple[Reason, ...]:
     """Return CLOCKS_DRIFT if a rate and its effect over ``duration``, s, are significant."""
-    min_size = 0.01        # s: the samples of most odometers are farther apart
-    if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= min_size:
+    if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= 0.01:    # s: sample intervals
         return ()
     return (Reason(Code.CLOCKS_DRIFT, f'{name} stamps: the clock is {1e6 * abs(rate):.0f} ppm (± '
                    f'{1e6 * sigma:.0f}) {"fast" if rate > 0 else "slow"} relative to the IMU, '
