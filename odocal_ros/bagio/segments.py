@@ -21,7 +21,7 @@ from odocal_ros.bagio.bag_file import Channel
 from odocal_ros.bagio.mcap_write import PackedChunk, read_chunks, write_file, Written
 from odocal_ros.safe_io.atomic_files import disk, write_text
 
-JOURNAL = 'journal.yaml'     # marks the folder as a journal, and has its settings
+JOURNAL_FILE = 'journal.yaml'     # marks the folder as a journal, and has its settings
 # the node's status, which contains the marks of legs; its events for legs that replay omits
 STATUS_NAME, STATUS_TYPE = 'calibrator: calibration', 'diagnostic_msgs/msg/DiagnosticArray'
 DROPPED_EVENTS = ('cancelled', 'undone')
@@ -39,7 +39,7 @@ def joined_name(folder: Path, number: int = 0) -> str:
     return f'{folder.name}_{number}.mcap'
 
 
-def without_joined(files: Sequence[Path]) -> list[Path]:
+def without_duplicates(files: Sequence[Path]) -> list[Path]:
     """Return the files of a journal without those whose messages are also in another file."""
     matches = {path: NUMBERED.fullmatch(path.name) for path in files}
     without_number = [path for path, match in matches.items() if match is None]

@@ -12,7 +12,7 @@ import sqlite3
 from typing import Any
 
 from odocal_ros.bagio.bag_file import is_valid_time
-from odocal_ros.bagio.segments import JOURNAL, without_joined
+from odocal_ros.bagio.segments import JOURNAL_FILE, without_duplicates
 from odocal_ros.errors import BadBag
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.safe_io import limits
@@ -90,8 +90,8 @@ def _source_of_folder(path: Path) -> Source:
         files = _without_links(sorted((f for f in path.iterdir()
                                        if f.name.endswith(ENDINGS) and limits.is_file(f)),
                                       key=_number_key))
-        if (path / JOURNAL).exists():
-            files = without_joined(files)
+        if (path / JOURNAL_FILE).exists():
+            files = without_duplicates(files)
         if not files:
             raise BadBag(f'{path}: holds no .mcap, .db3 or .bag file{_hint_on_subfolders(path)}')
         fault = 'names no existing file' if listed else 'is missing'
@@ -165,7 +165,7 @@ def _span(metadata: dict[str, Any]) -> Span | None:
     end_ns = (int(metadata['starting_time']['nanoseconds_since_epoch'])
               + int(metadata['duration']['nanoseconds']))
     count = int(metadata['message_count'])
-    if not (is_valid_time(end_ns) and 0 <= count < limits.LATEST_NS):
+    if not (is_valid_time(end_ns) and 0 <= count < 2**62):    # fits int64
         raise ValueError('invalid times or counts')
     return Span(end_ns, count)
 

@@ -20,8 +20,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.rotations import exp_so3, skew
 
-# unknowns of a keyframe in order, and their numbers. The travel error is that of the odometer
-# reading, in scale units, bounded by rounding; the slow fix error is the time-correlated one
+# unknowns of a keyframe, and their numbers. Travel error: of the odometer reading, in scale units
+# (pulses, rad or configured m), bounded by rounding; slow fix error: the time-correlated one
 BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
          'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU': 3}
 P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
@@ -98,7 +98,7 @@ FIX_BY_MOTION, FIX_MOTION_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'f
 # relative change of the scale from its mean over the path, (S11): with the square of the speed
 # (its slope at FAST_SPEED, s/m), with time as tyres warm (its rate at the start of the leg, 1/s),
 # with traction and braking, 1/(m/s^2): a wheel that is not driven only brakes; with the force to
-# the left, of one wheel that turns load or relieve; and with half the squared curvature, m^2:
+# the left, as turns load or unload a wheel; and with half the squared curvature, m^2:
 # -x^2 of a steered wheel at x ahead, -x^2 / 2 of the mean of four wheels
 TYRES = constants_from('scale_by_speed', 'scale_by_curvature')
 SCALE_BY_SPEED, SCALE_BY_TIME, SCALE_BY_LEFT_FORCE, SCALE_BY_CURVATURE = map(CONSTANTS.index, (
@@ -113,13 +113,13 @@ SCALE_BY_PITCHING = CONSTANTS.index('scale_by_pitching')
 PITCH_LEAN = constants_from('squat', 'squat_by_jerk')
 YAW_LEAN = constants_from('sideslip', 'sideslip_by_jerk')
 # displacements of the axle due to the tilt of the body, (S12): points about which it pitches, m
-# ahead of the odometer: on hills; in addition on bumps; in turns about its own left axis, on
-# banked ground. Height above the odometer, m, of the centre about which it tilts on its springs;
-# its sway there under lateral force, m per m/s^2. Lift of the axle in turns, m/rad: the third
-# point times the mean roll of the ground, (S12)
+# ahead of the odometer: on hills; on bumps, in addition; in turns on banked ground, for the
+# turn rate about its own left axis. Height above the odometer, m, of the centre about which it
+# tilts on its springs; its sway there under lateral force, m per m/s^2. Lift of the axle in turns,
+# m/rad: the third point times the mean roll of the ground, (S12)
 BODY_TILT = constants_from('pitch_centre', 'lift_by_turning')
 LIFT = constants_from('lift_by_turning')
-# rad, left side up: mean roll of the ground of a leg. The mean attitude less this one determines
+# rad, left side up: mean roll of the ground of a leg. The mean attitude minus this roll determines
 # the roll of the IMU in the vehicle
 MEAN_ROLL = CONSTANTS.index('mean_roll')
 # constants of the ground of a leg

@@ -34,7 +34,7 @@ from odocal_ros.screening.leg_kind import missing_force_cause
 from odocal_ros.settings.config import Config
 
 DRIVE_ROWS = 1000         # judgement: rows of a drive for a prediction
-# judgement: the accuracy is that of the last rows up to this time after the start mark
+# judgement: the heading sigma is from the last rows up to this time after the start mark
 ORIENTATION_NS, ORIENTATION_ROWS = 10**9, 100
 DRIVE_ON = 'drive on with stops, starts and turns'
 
@@ -62,15 +62,15 @@ def forecast_leg(leg: Leg, fix_rate: float, config: Config,
     missing_force = missing_force_cause(leg.imu, config.imu.accel_scale)
     running = smoother_forecast.update_running(leg, config, smoother, is_needed)
     only_smoother = deciding_methods(config.method) == smoother_forecast.ONLY_SMOOTHER
-    if only_smoother or smoother_forecast.has_all_values(running):     # two_point gives no value
+    if only_smoother or smoother_forecast.has_all_values(running):     # two_point is not used
         forecast = Forecast(ParameterForecast(None, config.verdict.max_scale_sigma, None),
                             ParameterForecast(None, config.verdict.max_yaw_sigma, None))
     else:
         forecast = _forecast_by_end_points(leg, fix_rate, config, is_needed)
         if smoother is not None and 'smoother' in deciding_methods(config.method):
-            forecast = replace(forecast, scale=_without_refusal(forecast.scale))
+            forecast = replace(forecast, scale=_or_drive_on(forecast.scale))
             if not missing_force:
-                forecast = replace(forecast, yaw=_without_refusal(forecast.yaw))
+                forecast = replace(forecast, yaw=_or_drive_on(forecast.yaw))
     if missing_force:
         forecast = smoother_forecast.without_accelerometer_values(forecast)
     if not is_needed():
@@ -101,7 +101,7 @@ def _forecast_by_end_points(leg: Leg, fix_rate: float, config: Config,
         metres = 0.0 if sigma is not None and sigma <= limit else None
         if metres is None and not limitation:
             metres = find_remaining_distance(drive, sigmas, parameter, limit, lengthen)
-            limitation = UNREACHABLE_TEXT
+            limitation = UNREACHABLE_TEXT      # printed if metres is None
         return ParameterForecast(sigma, limit, metres,
                                  main_sources(prediction.method, parameter), limitation)
 
@@ -113,10 +113,9 @@ def _forecast_by_end_points(leg: Leg, fix_rate: float, config: Config,
         prediction.method.estimates[smoother_forecast.PITCH].sigma)
 
 
-def _without_refusal(two_point: ParameterForecast) -> ParameterForecast:
-    """Return the forecast of two_point; if it cannot reach the limit, the smoother still may."""
-    return two_point if two_point.remaining_m is not None else replace(two_point,
-                                                                       manoeuvre=DRIVE_ON)
+def _or_drive_on(two_point: ParameterForecast) -> ParameterForecast:
+    """Return the two_point forecast; with DRIVE_ON, for the smoother, if it misses the limit."""
+    return replace(two_point, manoeuvre=DRIVE_ON) if two_point.remaining_m is None else two_point
 
 
 def _yaw_limit_reason(prediction: Prediction, limit: float) -> str:
@@ -143,7 +142,7 @@ def _with_expected_heading(leg: Leg, config: Config) -> Config:
 
 
 def _thin_rows(drive: PlannedDrive) -> PlannedDrive:
-    """Return a drive with at most about DRIVE_ROWS rows; its stops and starts are kept."""
+    """Return a drive with at most about DRIVE_ROWS rows; stops and starts are kept if few."""
     rest = np.abs(drive.speed) <= REST_SPEED
     changes = np.flatnonzero(np.diff(rest))      # last rows before a stop or a start
     if len(changes) > DRIVE_ROWS // 4:

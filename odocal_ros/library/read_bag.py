@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from odocal_ros.bagio.read import Bag, bag_sha256, open_bag
-from odocal_ros.bagio.segments import JOURNAL
+from odocal_ros.bagio.segments import JOURNAL_FILE
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg, LegRecorder, SLOTS
 from odocal_ros.data.samples import OdometerForm, Samples
@@ -53,7 +53,7 @@ def journal_notes(bag: Path) -> JournalNotes | None:
 
     Raises BadUsage: the settings file is not regular; BadConfig: its settings are not valid.
     """
-    path = (bag if bag.is_dir() else bag.parent) / JOURNAL
+    path = (bag if bag.is_dir() else bag.parent) / JOURNAL_FILE
     if not path.exists():
         return None
     if not is_file(path):

@@ -69,7 +69,7 @@ def _stack_fits(result: Calibration,
 
 
 def _at_track(smoothed: dict[str, Any], column: Floats) -> Floats:
-    """Return the rows of a column by keyframe at the times of the stored track."""
+    """Return the rows of a column by keyframe at the times of the track, all of keyframes."""
     return np.asarray(column[np.searchsorted(smoothed['key_t'], smoothed['track_t'])])
 
 

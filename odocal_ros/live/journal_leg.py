@@ -15,7 +15,7 @@ from typing import TextIO
 
 from odocal_ros.bagio.bag_file import Channel
 from odocal_ros.bagio.mcap_write import PackedChunk
-from odocal_ros.bagio.segments import JOURNAL, SegmentedBag
+from odocal_ros.bagio.segments import JOURNAL_FILE, SegmentedBag
 from odocal_ros.safe_io.atomic_files import new_folder, PART, write_text
 
 JOURNAL_NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
@@ -31,7 +31,7 @@ def journal_folders(root: Path) -> list[Path]:
         for folder in root.iterdir():
             with suppress(OSError):
                 if not folder.is_symlink():
-                    dated.append(((folder / JOURNAL).stat().st_mtime_ns, folder))
+                    dated.append(((folder / JOURNAL_FILE).stat().st_mtime_ns, folder))
     return [folder for _, folder in sorted(dated)]
 
 
@@ -42,7 +42,7 @@ def clear_empty(root: Path) -> None:
             is_journal = JOURNAL_NAME.fullmatch(folder.name) and not folder.is_symlink()
             is_old = is_journal and folder.stat().st_mtime < time.time() - NEW_FOLDER_S
             # these files never contain a message
-            if is_old and all(path.name == JOURNAL or path.name.endswith(PART)
+            if is_old and all(path.name == JOURNAL_FILE or path.name.endswith(PART)
                               for path in folder.iterdir()) and not _in_use(folder):
                 shutil.rmtree(folder)
 
@@ -71,7 +71,7 @@ def make_room(root: Path, limit: int, needed: int = 0) -> int:
 
 def lock_journal(folder: Path) -> TextIO:
     """Lock a journal as in use, until the returned file is closed or the process ends."""
-    file = (folder / JOURNAL).open(encoding='utf-8')
+    file = (folder / JOURNAL_FILE).open(encoding='utf-8')
     with suppress(OSError):      # a file system without locks: its use is unknown
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return file
@@ -79,7 +79,7 @@ def lock_journal(folder: Path) -> TextIO:
 
 def _in_use(folder: Path) -> bool:
     try:
-        with (folder / JOURNAL).open(encoding='utf-8') as file:
+        with (folder / JOURNAL_FILE).open(encoding='utf-8') as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
@@ -189,7 +189,7 @@ class LegJournal:
         self._other_bytes = make_room(root, self.plan.limit)
         folder = new_folder(root, self.plan.name)
         try:
-            write_text(folder / JOURNAL, self.plan.settings)
+            write_text(folder / JOURNAL_FILE, self.plan.settings)
             self._lock = lock_journal(folder)
         except OSError:
             shutil.rmtree(folder, ignore_errors=True)

@@ -30,8 +30,8 @@ class _MovingFrame:
 
     parent: str
     newest_ns: int = -1
-    stamps: list[int] = field(default_factory=list)      # ns, as the next one
-    received: list[int] = field(default_factory=list)    # arrivals
+    stamps: list[int] = field(default_factory=list)      # ns
+    received: list[int] = field(default_factory=list)    # ns, arrivals
     values: list[Transform] = field(default_factory=list)
 
     def add(self, stamp_ns: int, received_ns: int, values: Transform) -> None:

@@ -23,12 +23,12 @@ def indoor_screen(runs: list[PlannedRun]) -> str:
     robot, method = runs[0].robot, runs[0].method
     names = [name for name in SHOWN if name in method.estimates
              and not (name == 'yaw_mounting_angle' and method.name == 'planar')]
-    drift = (f', correlated errors {1000 * robot.drift_sigma:.2g} mm over {robot.drift_length:g} m'
-             if robot.drift_sigma else '')
+    drift = (f', correlated errors {1000 * robot.drift_sigma:.2g} mm '
+             f'(correlation length {robot.drift_length:g} m)' if robot.drift_sigma else '')
     where = ' at standstills' if robot.at_rests else f' at {robot.position_rate:g} Hz'
     lines = [f'{robot.drive}, {robot.wheels} wheels, {"with" if robot.imu else "without"} an IMU; '
              f'method {method.name}',
-             f'positions {1000 * robot.position_sigma:.2g} mm{where}{drift}; wheel slip '
+             f'position sigma {1000 * robot.position_sigma:.2g} mm{where}{drift}; wheel slip '
              f'{1000 * robot.slip:.2g} mm/√s', '']
     heads = ['scale', 'right / left', *(SHOWN[name] for name in names[1:])]
     widths = (28, *(max(len(head) + 3, 11) for head in heads))

@@ -33,7 +33,7 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     if not config.odometer.wheel_keys and not {'odometer', 'odometer_right'} & mapping.keys() and (
             pair := _left_right_pair(topics, [
                 topic for topic in candidates(topics, 'odometer', config, mapping)
-                if topic not in unsuitable])):
+                if topic not in unsuitable])):      # each wheel has its own topic
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
         mapping['odometer'], mapping['odometer_right'] = pair
     for slot in required_slots(config):
@@ -90,7 +90,7 @@ def other_candidates(topics: dict[str, TopicInfo], slot: str, config: Config,
 
 
 def replay_refusal(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
-    """Return the error of replay if it cannot choose the topics without options; '' if none."""
+    """Return the error of replay if it needs more topic options than overrides; '' if none."""
     try:
         choose_topics(topics, config, overrides)
     except BadUsage as error:

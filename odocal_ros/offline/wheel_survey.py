@@ -156,8 +156,8 @@ def motion_texts(facts: list[dict[str, Any]]) -> list[str]:
         side = f'; {value["side"]} side (matches gyro)' if value['side'] else ''
         scale = f', {value["scale"]:.3g} m/{unit.rstrip("s")}' if value['scale'] else ''
         kind = f'a wheel{scale}{side}' if value['rolls'] else 'no wheel'
-        lines.append(f'{value["key"]} travels {value["distance"]:.5g} {unit} in total, range '
-                     f'{value["span"]:.5g} {unit}: {kind}')
+        lines.append(f'{value["key"]} travels {value["distance"]:.5g} {unit} in total; its '
+                     f'values span {value["span"]:.5g} {unit}: {kind}')
     return lines
 
 

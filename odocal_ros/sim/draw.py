@@ -53,7 +53,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
     if 'scale' in fixed_options:     # keep the drawn relative error of the nominal scale
         ratio = options['nominal_scale'] / options['scale']
         fixed_options = {'nominal_scale': fixed_options['scale'] * ratio} | fixed_options
-    options |= fixed_options      # seen by the effects; again below, they may change options
+    options |= fixed_options      # for the effects; again below, as effects may replace them
     if effects is None:
         odometer_effect = ('', 'coarse_pulses', 'coarse_speed')[int(make_rng(
             seed, 'vehicle odometer').choice(3, p=vehicle.grade_value('odometers')))]
@@ -71,7 +71,7 @@ def draw_vehicle(seed: int, kind: str, grade: str, effects: Sequence[str] | None
 
 
 def _ideal_vehicle(seed: int, kind: str, grade: str,
-                   effects_requested: bool) -> tuple[Vehicle, dict[str, Any]]:
+                   effects_certain: bool) -> tuple[Vehicle, dict[str, Any]]:
     """Return a drawn vehicle and its SimOptions before any effect; numbers: docs/zoo.md."""
     rng, grade_index = make_rng(seed, 'vehicle'), DRAWN_GRADES.index(grade)
     roll, pitch, yaw = (math.radians(sigma) * rng.standard_normal()
@@ -98,4 +98,4 @@ def _ideal_vehicle(seed: int, kind: str, grade: str,
         'nominal_scale': scale, 'scale': scale * (1 + scale_error)}
     options = {k: float(v) if isinstance(v, np.floating) else v for k, v in options.items()}
     return Vehicle(grade, kind, rtk, city and kind != 'motorway', robot, options,
-                   effects_requested), options
+                   effects_certain), options

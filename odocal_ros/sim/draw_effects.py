@@ -96,7 +96,7 @@ def grade(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
 
 def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Quantise speeds as a vehicle bus does, with a dead band; in 3 of 10 to whole km/h."""
-    whole_kmh = vehicle.effects_requested or rng.uniform() < 0.3      # as in OBD-II
+    whole_kmh = vehicle.effects_certain or rng.uniform() < 0.3      # as in OBD-II
     resolutions = (0.0075, 0.01, 0.031, 0.056, 0.06)     # km/h, of vehicle buses
     real = {'speed_step': KMH * (1.0 if whole_kmh else float(rng.choice(resolutions))),
             'speed_rounding': str(rng.choice(['floor', 'round']))}
@@ -153,7 +153,7 @@ def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
 
 def fix_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Stamp fixes at their arrival, as half of the drivers do."""
-    if vehicle.grade == 'tactical' or not (vehicle.effects_requested or rng.uniform() < 0.5):
+    if vehicle.grade == 'tactical' or not (vehicle.effects_certain or rng.uniform() < 0.5):
         return Effect()
     return Effect(real={'fix_jitter': 0.01}, options={'fix_delay': lognormal(rng, 0.12, 0.4)})
 
@@ -173,7 +173,7 @@ def multipath(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     if vehicle.rtk:
         return Effect(real={'bursts': 12.0 if vehicle.city else 1.0, 'burst_size': 0.6,
                             'burst_time': 60.0})
-    if not (vehicle.city or vehicle.effects_requested):
+    if not (vehicle.city or vehicle.effects_certain):
         return Effect()
     return Effect(real={'bursts': 40.0, 'burst_size': 12.0, 'burst_time': 8.0})
 
@@ -187,7 +187,7 @@ def covariance(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
 def outages(rng: np.random.Generator, vehicle: Vehicle) -> Effect:
     """Draw outages, and a loss of one fix in a hundred."""
     spans = []
-    for _ in range(int(rng.poisson(3.0 if vehicle.city else 1.0)) + vehicle.effects_requested):
+    for _ in range(int(rng.poisson(3.0 if vehicle.city else 1.0)) + vehicle.effects_certain):
         begin = float(rng.uniform(30.0, 500.0))
         spans.append((begin, begin + min(lognormal(rng, 10.0, 1.0), 90.0)))
     return Effect(real={'drops': 0.01}, options={'outages': tuple(sorted(spans))})

@@ -99,7 +99,8 @@ class Drive:
         fix = self.fix
         if self.options.reference != 'fix':
             covariance = [fix.covariance_n] if self.reference.has_covariance else []
-            fix = local_fixes(np.nan)(fix.stamp_ns, fix.received_ns, self.positions(), *covariance)
+            make_fixes = local_fixes(latitude_deg=np.nan)
+            fix = make_fixes(fix.stamp_ns, fix.received_ns, self.positions(), *covariance)
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(self.truth.start_ns, self.truth.stop_ns, form=self.form).with_rows(
             imu=self.imu, fix=fix, heading=self.heading, fix_velocity=self.velocity,

@@ -76,7 +76,7 @@ class Vehicle:
     city: bool       # multipath, outages, worse covariances
     robot: bool      # small, slow, without springs
     options: dict[str, Any]    # fields of SimOptions, before any effect
-    effects_requested: bool    # by the user, by name: each is then present, not by chance
+    effects_certain: bool    # the user names the effects: each is present, not by chance
 
     def grade_value(self, name: str) -> Any:
         """Return the entry of BY_GRADE for the vehicle's grade."""
@@ -95,5 +95,5 @@ def lognormal(rng: np.random.Generator, median: float, log_sigma: float) -> floa
 
 
 def flat(values: Floats) -> tuple[float, ...]:
-    """Return the numbers of an array of any shape, row by row."""
+    """Return the numbers of an array of any shape, row by row, as one tuple."""
     return tuple(float(x) for x in np.ravel(values))

@@ -19,7 +19,7 @@ from odocal_ros.bagio.bag_file import Channel
 from odocal_ros.bagio.mcap_records import CHUNK_HEAD, text_at
 from odocal_ros.bagio.mcap_write import pack, read_chunks, write_file
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.bagio.segments import joined_name, JOURNAL, part_name, SegmentedBag
+from odocal_ros.bagio.segments import joined_name, JOURNAL_FILE, part_name, SegmentedBag
 from odocal_ros.errors import BadBag
 from odocal_ros.safe_io.atomic_files import PART
 
@@ -42,7 +42,7 @@ def second(k, rate=20):
 def grown(folder, number):
     """Return a bag of so many segments, not finished, and its messages by topic."""
     folder.mkdir(parents=True)
-    (folder / JOURNAL).touch()
+    (folder / JOURNAL_FILE).touch()
     bag, messages = SegmentedBag(folder), {'/imu/data': [], '/odometer': []}
     bag.channels = CHANNELS
     for k in range(number):
@@ -136,7 +136,8 @@ def test_a_growing_bag_is_read_at_any_moment(tmp_path):
 def test_a_finished_bag_is_one_file_with_metadata(tmp_path):
     bag, messages = grown(tmp_path / 'leg', 4)
     assert bag.finish() == bag.folder / 'leg_0.mcap'
-    assert sorted(p.name for p in bag.folder.iterdir()) == [JOURNAL, 'leg_0.mcap', 'metadata.yaml']
+    assert sorted(p.name for p in bag.folder.iterdir()) == [
+        JOURNAL_FILE, 'leg_0.mcap', 'metadata.yaml']
     assert read(bag.folder) == messages
     with rosbag2.Reader(bag.folder) as reader:
         assert (reader.message_count, reader.ros_distro) == (160, 'jazzy')
@@ -202,11 +203,11 @@ def test_a_mark_is_added_to_a_finished_bag(tmp_path, free_bytes, metadata):
 def test_file_names_are_checked_in_journals_only(tmp_path):
     bag, _ = grown(tmp_path / 'leg', 2)
     (bag.folder / part_name(0, 0)).rename(bag.folder / part_name(0, 5))
-    (bag.folder / JOURNAL).unlink()
+    (bag.folder / JOURNAL_FILE).unlink()
     assert len(read(bag.folder)['/odometer']) == 40
 
 
 def test_an_empty_folder_of_a_journal_is_reported(tmp_path):
-    (tmp_path / JOURNAL).touch()
+    (tmp_path / JOURNAL_FILE).touch()
     with pytest.raises(BadBag, match='holds no .mcap'), open_bag(tmp_path):
         pass

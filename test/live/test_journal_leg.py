@@ -14,7 +14,7 @@ from odocal_ros.bagio import segments
 from odocal_ros.bagio.bag_file import Channel
 from odocal_ros.bagio.mcap_write import pack
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.bagio.segments import JOURNAL
+from odocal_ros.bagio.segments import JOURNAL_FILE
 from odocal_ros.live import journal_leg
 
 SECOND = 10**9
@@ -147,9 +147,9 @@ def test_old_empty_journals_are_removed(tmp_path):
             (tmp_path / name / file).touch()
         os.utime(tmp_path / name, (10**9, 10**9))
     aged(NAME)
-    aged(f'{NAME}-2', JOURNAL)
-    aged(f'{NAME}-3', JOURNAL, '.part_000000.mcap.part')
-    aged(f'{NAME}-4', JOURNAL, 'part_000000.mcap')
+    aged(f'{NAME}-2', JOURNAL_FILE)
+    aged(f'{NAME}-3', JOURNAL_FILE, '.part_000000.mcap.part')
+    aged(f'{NAME}-4', JOURNAL_FILE, 'part_000000.mcap')
     aged('mine')
     (tmp_path / f'{NAME}-5').mkdir()
     journal_leg.clear_empty(tmp_path)
@@ -160,8 +160,8 @@ def folder_of(root, name, size, age):
     """Make a folder like a journal; size in bytes, age in s."""
     folder = root / name
     folder.mkdir(parents=True)
-    (folder / JOURNAL).touch()
-    os.utime(folder / JOURNAL, ns=(0, -age * SECOND + 10**18))
+    (folder / JOURNAL_FILE).touch()
+    os.utime(folder / JOURNAL_FILE, ns=(0, -age * SECOND + 10**18))
     (folder / 'part.mcap').write_bytes(bytes(size))
     return folder
 

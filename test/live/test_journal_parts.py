@@ -13,7 +13,7 @@ import ros_bags
 import ros_messages as make
 
 from odocal_ros.bagio.mcap_write import pack
-from odocal_ros.bagio.segments import JOURNAL
+from odocal_ros.bagio.segments import JOURNAL_FILE
 from odocal_ros.errors import BadConfig
 from odocal_ros.library.read_bag import journal_notes
 from odocal_ros.live import journal_writer
@@ -34,7 +34,7 @@ def test_settings_are_read_back_from_the_journal_without_any_change(tmp_path):
         'odometer.nominal_scale': 1e-5, 'reference.start': (48.1, 11.5, 1e-7, 2),
         'odometer.signed': False, 'journal.max_bytes': 2**40, 'output.formats': ()})
     topics = {'imu': '/car/imu', 'odometer': '/car/joint states'}
-    (tmp_path / JOURNAL).write_text(journal_text(config, 3, 5, topics), encoding='utf-8')
+    (tmp_path / JOURNAL_FILE).write_text(journal_text(config, 3, 5, topics), encoding='utf-8')
     found = journal_notes(tmp_path)
     assert found.topics == topics
     expected = flat(config)
@@ -81,7 +81,7 @@ def test_replay_uses_the_topics_of_the_journal(tmp_path, capsys):
     assert main(ask) == 2
     assert '2 topics can be the IMU' in capsys.readouterr().err
     topics = {'imu': '/imu/data', 'odometer': '/odometer', 'heading': '/not/in/it'}
-    (bag / JOURNAL).write_text(journal_text(Config(), 1, 1, topics))
+    (bag / JOURNAL_FILE).write_text(journal_text(Config(), 1, 1, topics))
     assert main(ask) == 1      # too short a drive, but calibrated
     assert json.loads((tmp_path / 'out' / 'calibration.json').read_text())['inputs'][0][
         'topics'] == {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}

@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 
-from odocal_ros.bagio.segments import JOURNAL
+from odocal_ros.bagio.segments import JOURNAL_FILE
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.calib import result
 from odocal_ros.library.calibration import Calibration
@@ -88,7 +88,7 @@ def test_the_settings_of_the_last_used_bag_apply(bags, tmp_path, capsys, monkeyp
     """A dropped leg is not used, and neither are its settings."""
     for name, limit in (('one', 3), ('other', 5), ('dropped', 7)):
         shutil.copytree(bags / name.replace('dropped', 'one'), tmp_path / name)
-        (tmp_path / name / JOURNAL).write_text(
+        (tmp_path / name / JOURNAL_FILE).write_text(
             f'/**:\n  ros__parameters:\n    verdict.min_legs: {limit}\n')
     monkeypatch.setattr('odocal_ros.library.read_bag.has_dropped_legs',
                         lambda bag: bag.name == 'dropped')
