@@ -35,8 +35,9 @@ def calibrated(how='zero', **options):
 def scale_alone(made, calibration):
     """Check that a calibration with a caution has the scale, within its sigma, and no angle."""
     scale = calibration.estimates['scale_factor']
-    # 240 ppm from fixes of 1.5 m, 500 ppm from hills that are not measured
-    assert abs(scale.value - made.truth.scale) < 3 * scale.sigma < 0.003 * made.truth.scale
+    # at most 490 ppm from fixes of 1.5 m, 500 from hills that are not measured, 460 from noise of
+    # the travel, 450 from forces, 280 from tyres, yaw gyro and heights
+    assert abs(scale.value - made.truth.scale) < 3 * scale.sigma < 0.00303 * made.truth.scale
     assert all(calibration.estimates[name].value is None for name in ANGLES)
     assert calibration.verdict is Verdict.CAUTION
 

@@ -185,9 +185,9 @@ def low_passed(leg, seconds):
 
 
 def test_residual_of_a_filter_at_speed_changes_is_not_slip():
-    """Three filters in series: not of first order, the type that the fit models."""
+    """Four filters in series: not of first order, the type that the fit models."""
     _, config, leg = made(**SHORT, fix_noise='rtk')
-    for _ in range(3):
+    for _ in range(4):
         leg = low_passed(leg, 0.2)
     method = smooth(leg, config)
     assert reason_text(method, Code.SPEED_FILTERED)

@@ -16,6 +16,7 @@ from pages import all_commands
 from player import messages_of, playing_to, straight, within
 import pytest
 from rclpy.node import NodeNameNonExistentError
+from ros_bags import STORAGES
 import yaml
 
 from odocal_ros.live.messages import message_class
@@ -196,7 +197,7 @@ def test_every_ros2_command_of_the_docs_is_tested_here():
     assert {(words[1],) if words[1] in alone else tuple(words[1:3])
             for _, words in LINES} == {*((word,) for word in alone), ('service', 'call'),
                                        ('topic', 'echo'), ('param', 'get'), ('param', 'set'),
-                                       ('param', 'dump'), ('bag', 'record')}
+                                       ('param', 'dump'), ('bag', 'record'), ('bag', 'convert')}
 
 
 def test_run_and_odocal_name_commands_of_the_package():
@@ -273,3 +274,12 @@ def test_recorded_topics_are_published(driven):
         topics = [word for word in words if word.startswith('/')]
         assert set(topics) == {*TOPICS.values(), *status}
         wait_for(lambda topics=topics: set(topics) <= set(driven.graph()), 'the topics')
+
+
+def test_the_file_for_converting_names_a_format_that_replay_reads():
+    (option_in, _, option_out, name), = of('bag', 'convert')
+    page = (ROOT / 'docs/from_a_bag.md').read_text()
+    bag, = yaml.safe_load(re.search(rf'{name} is `([^`]*)`', page)[1])['output_bags']
+    assert (option_in, option_out) == ('-i', '-o')
+    assert bag['storage_id'] in STORAGES
+    assert bag['all_topics'] is True
