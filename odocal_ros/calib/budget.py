@@ -208,8 +208,8 @@ def budget_table(sources: Iterable[Source], parameters: Sequence[str],
                      for i, p in enumerate(parameters)} | {'shared': s.shared} for s in sources}
 
 
-def known_budget(sources: Iterable[Source], parameters: Sequence[str],
-                 estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+def budget_details(sources: Iterable[Source], parameters: Sequence[str],
+                   estimates: Mapping[str, Estimate]) -> dict[str, Any]:
     """Return ``budget`` and ``correlation`` of the parameters that have a value."""
     known = [i for i, p in enumerate(parameters) if estimates[p].value is not None]
     names = [parameters[i] for i in known]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from odocal_ros.calib.budget import known_budget
+from odocal_ros.calib.budget import budget_details
 from odocal_ros.calib.joint import NORMAL_95, normal_deviate
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.data.arrays import Floats
@@ -58,7 +58,7 @@ def combine_method(name: str, results: Sequence[MethodResult],
             effects.setdefault(source, np.zeros((len(parameters), len(effect))))[i] = effect
     estimates |= _scale_ratio(results, estimates) | last_leg_values(results, estimates)
     sources = tuple(Source(source, effect, source != 'legs') for source, effect in effects.items())
-    details = known_budget(sources, parameters, estimates) if sources else {}
+    details = budget_details(sources, parameters, estimates) if sources else {}
     return MethodResult(name, reasons, estimates, parameters, sources,
                         {'legs_used': len(results)} | details)
 

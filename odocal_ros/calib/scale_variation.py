@@ -20,8 +20,8 @@ from odocal_ros.nav.time_series import robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS, TYRE_SPREAD
 
-# lags of the correlation of residuals, in blocks: judgement, the next block and one at which
-# additional white noise does not hide it
+# lags of the correlation of residuals, in blocks. Judgement: the next block, and a lag at which
+# white noise does not hide the correlation
 BLOCK_LAGS = (1, 3)
 # judgement: grid of the correlation from block to block, finer where the sigma of a scale grows
 CORRELATIONS = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
@@ -100,8 +100,7 @@ def _similarity(source: Complexes, target: Complexes) -> Similarity:
 
 def _scale_sigmas(fits: list[Similarity], stated: float) -> list[float]:
     """Return the sigma of the scale of each fit; stated : sigma of a fix, m."""
-    # variance and correlation of the errors are those of the first-order process whose residuals
-    # have the observed mean square and correlation
+    # errors: the first-order process with the observed mean square and correlation of residuals
     if not fits:
         return []
     residuals = [fit.residual for fit in fits]
@@ -109,8 +108,8 @@ def _scale_sigmas(fits: list[Similarity], stated: float) -> list[float]:
     residual_power, slope_variance, *correlations = _residual_properties(n)
     power = np.array([np.vdot(r, r).real / len(r) for r in residuals]) / 2
     square = sum(np.vdot(r, r).real for r in residuals)
-    # index in CORRELATIONS, with a fraction. Additional white noise hides the correlation at the
-    # next block, not at the longer lag, which needs enough blocks: the larger index is used
+    # index in CORRELATIONS, with a fraction: the larger one, since white noise hides the
+    # correlation at the next block. The longer lag needs enough blocks
     grid = np.arange(len(CORRELATIONS))
     index = max(np.interp(sum(np.vdot(r[:-lag], r[lag:]).real for r in residuals)
                           / square if square else 0.0, row, grid)
@@ -126,7 +125,7 @@ def _residual_properties(n: int) -> Floats:
     """
     Return properties of a line fitted to n rows of a first-order process, by CORRELATIONS: (4, c).
 
-    Mean square of residuals and variance of the slope per variance, correlations at BLOCK_LAGS.
+    For variance 1: mean square of residuals, variance of the slope; correlations at BLOCK_LAGS.
     """
     x = np.stack([np.ones(n), np.linspace(-1.0, 1.0, n)], -1)
     x /= np.linalg.norm(x, axis=0)
@@ -151,7 +150,7 @@ def counter_change_reasons(scales: Sections, t_fix: Floats,
     """
     known = np.flatnonzero(np.isfinite(scales.ratio) & (scales.ratio > 0))
     log_scale, sigma = np.log(scales.ratio[known]), scales.sigma[known]
-    changes: dict[float, tuple[int, float]] = {}      # by scatter over change: section, factor
+    changes: dict[float, tuple[int, float]] = {}      # scatter / change -> section, factor
     for k in range(1, len(known) - 1):
         sides = slice(k), slice(k + 1, None)
         before, after = (np.median(log_scale[side]) for side in sides)

@@ -47,7 +47,7 @@ def thinning(t: Floats, max_rate: float = EXTERNAL_RATE) -> slice:
 
 
 def enu_to_n(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
-    """Return the rotations from east, north, up at the vehicle to n, at times t: (m, 3, 3)."""
+    """Return C_np at times t, p: east, north, up at the vehicle: (m, 3, 3)."""
     latitude, longitude = (np.interp(t, inputs.t_fix, inputs.geodetic[:, i]) for i in (0, 1))
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 

@@ -173,7 +173,7 @@ def is_local(url: str) -> bool:
 
 
 def bag_fingerprint(url: str, settings: str) -> str:
-    """Return a hash of path, size and date of a bag, and of settings; raises BadBag."""
+    """Return a hash of path, size and date of a bag, and of settings, for seen/; raises BadBag."""
     try:
         fs, path = file_system(url)
         files = fs.find(path, detail=True) if fs.isdir(path) else {path: fs.info(path)}

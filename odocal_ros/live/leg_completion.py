@@ -75,7 +75,7 @@ class LegCompletion:
         self._saver.poll()
         self.decode_new_messages()
         if self._recording.has_time_jumped:
-            self._restart_after_jump()
+            self._restart_after_time_jump()
         self._stop_when_too_long()
         self._close_when_complete()
         if (view := self._view_at_stop) and self.session.state is State.COMPUTING:
@@ -121,7 +121,7 @@ class LegCompletion:
         return (f'the data is in {folder}; compute it with {replay_command(folder, start_ns)}'
                 if folder else 'it has no journal')
 
-    def _restart_after_jump(self) -> None:
+    def _restart_after_time_jump(self) -> None:
         jump = 'time jumped back (a bag restarted, or a clock was set)'
         if self.session.state is State.RECORDING or self._samples_until_ns is not None:
             self._log.warning(f'{jump}: leg {self.session.leg_id} is cancelled')

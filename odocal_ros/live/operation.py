@@ -23,7 +23,7 @@ from odocal_ros.pipeline.floor_marks import HALF_MARK, mark_positions, point_pos
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement: standstill before a mark, s: its positions take 2 HALF_MARK, odometer delay 0.5 s
+# judgement: standstill before a mark, s: time span of its positions, and an odometer delay
 MARK_STILL_S = 2 * HALF_MARK + 0.5
 
 
@@ -33,7 +33,7 @@ class AutomaticLegs(LegCompletion):
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self._search: LegSearch | None = None
-        self._search_settings: LegConfig | None = None      # the settings of the search
+        self._search_settings: LegConfig | None = None
         self._progress_start_ns = 0           # start of the leg whose distance is measured
         self._logged_changes: set[str] = set()      # changes of the scale that were logged
         self._recording.block_listener = self._receive
@@ -48,7 +48,7 @@ class AutomaticLegs(LegCompletion):
         """Hand a received block to the running estimate and to the search for legs."""
         self._running_estimate.feed(slot, block)
         if self._search is not None:
-            self._search.feed(slot, block, self._recording.inputs.form())
+            self._search.feed(slot, block, self._recording.inputs.odometer_form())
 
     def _update_search(self) -> None:
         """Create the search for the settings in force; none without leg.automatic."""
@@ -104,8 +104,8 @@ class AutomaticLegs(LegCompletion):
         if self._search is not None:
             self._search.restart(self._recording.newest_ns, at_rest=True)
 
-    def _restart_after_jump(self) -> None:
-        super()._restart_after_jump()
+    def _restart_after_time_jump(self) -> None:
+        super()._restart_after_time_jump()
         self._search = LegSearch(self._config()) if self._search_settings else None
 
     def _handle_leg_result(self, leg: worker.ComputedLeg | worker.UnusedLeg) -> None:
@@ -186,7 +186,7 @@ class Operation(AutomaticLegs):
                                                   advice=answers.advice_after_result(view))
             return success, f'no leg is running; the last result: {text}'
         if session.restored_result is not None:
-            form = self._recording.inputs.form()
+            form = self._recording.inputs.odometer_form()
             return answers.restored_answer(
                 session.restored_result, form.scale_unit if form else '', within_limits)
         raise CommandRefused('no leg is running and there is no result yet: call ~/start_leg '

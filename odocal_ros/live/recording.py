@@ -107,7 +107,7 @@ class Inputs:
         return {slot: source.topic for slot, source in self.by_slot.items()
                 if source.reader is not None and not (slot == 'imu' and self.without_imu)}
 
-    def form(self, slot: str = 'odometer') -> OdometerForm | None:
+    def odometer_form(self, slot: str = 'odometer') -> OdometerForm | None:
         """Return the meaning of odometer values; None without the topic or before its type."""
         source = self.by_slot.get(slot)
         return source.reader.form if source and source.reader else None
@@ -177,7 +177,7 @@ class Recording:
         self._distribute('fix', block, config, 0.0)
 
     def _distribute(self, slot: str, block: Samples, config: Config, known_scale: float) -> None:
-        self.progress.feed(slot, block, config, self.inputs.form(), known_scale)
+        self.progress.feed(slot, block, config, self.inputs.odometer_form(), known_scale)
         if self.block_listener is not None:
             self.block_listener(slot, block)
 
@@ -217,8 +217,8 @@ class Recording:
     def snapshot(self) -> LegRecorder:
         """Return the samples so far, for another thread."""
         copy = self.recorder.snapshot()
-        copy.form = self.inputs.form() or copy.form
-        copy.form_right = self.inputs.form('odometer_right')
+        copy.form = self.inputs.odometer_form() or copy.form
+        copy.form_right = self.inputs.odometer_form('odometer_right')
         return copy
 
     @property
@@ -236,7 +236,7 @@ class Recording:
 
     def two_wheels(self) -> bool:
         """Return True if there are two wheels, known as left and right."""
-        form = self.inputs.form()
+        form = self.inputs.odometer_form()
         first, second, third = (self.recorder.newest_ns(slot) > 0 for slot in WHEELS[:3])
         return first and second and not third and (form is None or form.sides_known)
 

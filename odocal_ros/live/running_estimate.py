@@ -24,8 +24,8 @@ from odocal_ros.reasons import Code, most_severe_first, Reason
 from odocal_ros.settings.config import Config
 
 UPDATE_PERIOD_NS = 5 * 10**9  # judgement: in IMU time, so that a fast replay has as many updates
-# tuned by benchmarks/live_load.py: share of one core for updates in the long run; the whole node
-# then needs less than 0.6 of the CPU of empty rclpy callbacks at 455 messages a second
+# tuned by benchmarks/live_load.py: share of one core for updates in the long run; at 455 messages
+# a second the node then needs less than 0.6 of the CPU of one with empty callbacks
 UPDATE_CPU_SHARE = 1 / 60
 
 Block: TypeAlias = tuple[str, Any]      # slot, rows
@@ -170,7 +170,7 @@ def _compute_update(thinned: ThinnedLeg, pre_roll: LegRecorder | None, new_block
 def _add_rows(thinned: ThinnedLeg, pre_roll: LegRecorder | None, new_blocks: list[Block],
               stop_event: threading.Event) -> None:
     """Add the pre-roll, if any, and the new blocks to the thinned leg."""
-    for slot in (slot for slot in SLOTS if slot != 'imu_other'):
+    for slot in (slot for slot in SLOTS if slot != 'imu_other'):      # other IMUs
         if stop_event.is_set():
             raise LegEnded
         blocks = [pre_roll.rows(slot)] if pre_roll is not None else []

@@ -46,7 +46,7 @@ def indoor_screen(runs: list[PlannedRun]) -> str:
 
 def _indoor_sigma(sigma: float | None, head: str) -> str:
     if sigma is None:
-        return 'unknown'
+        return '-'
     return f'{math.degrees(sigma):.2g} deg' if head == 'yaw' else f'{100 * sigma:.2g} %'
 
 
@@ -87,13 +87,13 @@ def _method_text(plan: Plan) -> str:
     for parameter, label in texts.MAIN_VALUES.items():
         by_method.setdefault(plan.method_of(parameter), []).append(label)
     return ', '.join(f'{" and ".join(labels) if len(by_method) > 1 else "all values"} '
-                     f'{"from " + method if method else "unknown"}'
+                     f'{"from " + method if method else "not determined"}'
                      for method, labels in by_method.items())
 
 
 def _sigma_text(parameter: str, sigma: float | None) -> str:
     if sigma is None:
-        return 'unknown'
+        return 'not determined'
     return (texts.relative_text(sigma) if parameter == SCALE
             else f'{significant(math.degrees(sigma))} deg')
 

@@ -147,7 +147,7 @@ def test_an_undetermined_yaw_is_reported_with_the_cause_and_the_remedy(tmp_path,
     assert main(['plan', '--gpx', path, '--imu-grade', 'consumer']) == 0
     out = capsys.readouterr().out
     # the axes of the IMU are wrong by half a degree: without turns the pitch is not observable
-    assert '(result: scale from smoother, yaw and pitch unknown' in out
+    assert '(result: scale from smoother, yaw and pitch not determined' in out
     plain_text = ' '.join(out.split())
     assert 'YAW_NOT_DETERMINED: yaw mounting uncertainty is' in plain_text
     assert 'Drive with stops, starts and turns' in plain_text
@@ -157,7 +157,7 @@ def test_an_undetermined_yaw_is_reported_with_the_cause_and_the_remedy(tmp_path,
     assert changes['5 min more, stop and go with turns'] < math.radians(0.05)
     lines = out.splitlines()
     begin = lines.index('  largest improvements of the yaw')
-    assert 'unknown ->' in lines[begin + 1]
+    assert 'not determined ->' in lines[begin + 1]
 
 
 @pytest.mark.parametrize(('method', 'shown', 'by'), [

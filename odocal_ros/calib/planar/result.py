@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from odocal_ros.calib.budget import known_budget
+from odocal_ros.calib.budget import budget_details
 from odocal_ros.calib.choice import PLANAR
 from odocal_ros.calib.planar.run import Fit
 from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_values
@@ -204,7 +204,7 @@ def _details(fit: Fit, estimates: dict[str, Estimate], names: tuple[str, ...],
     sigma = np.sqrt(np.diag(fit.covariance))
     constants = {name: {'value': float(v), 'sigma': float(s)}
                  for name, v, s in zip(fit.names, fit.value, sigma, strict=True)}
-    details: dict[str, object] = known_budget(sources, names, estimates) | {
+    details: dict[str, object] = budget_details(sources, names, estimates) | {
         'noise': fit.levels, 'constants': constants, 'passes': fit.passes}
     if 'gyro_scale' in constants:       # the factor on turn rates is 1 minus this error
         gyro = constants['gyro_scale']

@@ -15,8 +15,8 @@ from odocal_reproductions.paper.error_forms import SpeedProfile
 
 SCALE_REMARK = ('equal within 2e-11 in every printed row, not explained by plane or tilt: an '
                 'effect of numerics in the paper, not a reference value')
-FORMULA_REMARK = ("printed dK is the sphere's R in (30), (31) and the ellipsoid's C0 and C in "
-                  '(13), (14): phi_U / 2 times 0.0059')
+FORMULA_REMARK = ('printed dK comes from R of a sphere in (30), (31), but C0 and C of an '
+                  'ellipsoid in (13), (14): phi_U / 2 times 0.0059')
 SIGN_REMARK = '(30)-(33) are printed with the sign reversed against (27), (28)'
 
 
