@@ -175,12 +175,16 @@ class MotionRows(Factor):
         if self._noise_estimates is None or self._noise_estimates[0]() is not marginals:
             estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
             for rows in blocks(len(self.r)):
-                A = self.units(rows)
-                estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
-                fitted = marginals.covariance_form(rows, self.J[rows])
-                variances[rows] = (A * (A - fitted @ A)).sum(axis=1)
+                estimates[rows], variances[rows] = self._block_noises(rows, marginals)
             self._noise_estimates = ref(marginals), estimates, variances
         return self._noise_estimates[1:]
+
+    def _block_noises(self, rows: slice, marginals: JointMarginals) -> tuple[Floats, Floats]:
+        """Return ``_noises`` of some intervals; their arrays are freed before the next ones."""
+        fitted = marginals.covariance_form(rows, self.J[rows])
+        A = self.units(rows)
+        return (np.einsum('kic,ki->kc', A, self.r[rows]),
+                (A * (A - fitted @ A)).sum(axis=1))
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         by_unit, by_known = [], []
