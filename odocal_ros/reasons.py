@@ -85,8 +85,8 @@ class Code(Enum):
                                  'the IMU x axis points backwards, change the yaw of '
                                  'imu.mounting_rpy by 3.141592654 rad instead, or set '
                                  'imu.nominal_yaw.')
-    ODOMETER_STILL = REJECT, ('Check the wheel sensor, its wiring and the odometer topic. Of a '
-                              'nav_msgs/Odometry the twist is used, not the pose.')
+    ODOMETER_STILL = REJECT, ('Check the wheel sensor, its wiring and the odometer topic. '
+                              'nav_msgs/Odometry must contain the twist: its pose is not used.')
     SEVERAL_IMUS = REJECT, ('Set imu.frame_id to the IMU to calibrate, or publish each IMU on '
                             'its own topic.')
     IMU_UNITS = REJECT, ('Publish m/s^2 and rad/s (REP-145), or set imu.accel_scale / '

@@ -196,11 +196,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'than the vehicle moved. Brakes cannot spin a wheel, so this is not slip. Likely, the '
         'speed signal is held or late. Or, with a share of the path: at some speeds it counts '
         'more than at others.',
-        Code.SCALE_VARIES: 'The tyre radius grows with speed and temperature, a turn loads one '
-        'wheel and relieves the other, and a wheel that steers travels farther in turns: the '
-        'scale is not constant in this leg. The stated value is its mean over the path, for '
-        'straight travel; `scale_by_speed`, `scale_by_time`, `scale_by_left_force` and '
-        '`scale_by_curvature` are its slopes.',
+        Code.SCALE_VARIES: 'Tyres grow with speed and temperature, turns load one wheel and '
+        'unload the other, and a wheel that steers travels farther in turns. The stated value is '
+        'the mean over the path, for straight travel; `scale_by_speed`, `scale_by_time`, '
+        '`scale_by_left_force` and `scale_by_curvature` are the slopes.',
         Code.CHANGE_IN_LEG: 'Scale, yaw or pitch before and after this time differ by more than 5 '
         'sigma and 0.03 % or 0.017 deg: the IMU or its bracket moved, or tyres, load or '
         'odometer changed. The sigma of an angle was increased so that it covers both values; the '

@@ -84,9 +84,9 @@ def check_turns(inputs: Inputs, located: LocatedFixes, orientation: ImuOrientati
         else:
             text += (', but match the accelerations in turns: latitude and longitude (x and y) '
                      'are swapped, or linear_acceleration is negated')
-            remedy = ('Swap latitude and longitude in the driver of the fixes, or negate '
-                      'linear_acceleration in the IMU driver: what a map or a level IMU shows '
-                      f'to be wrong. {NO_ROTATION}')
+            remedy = ('Swap latitude and longitude in the driver of the fixes if a map shows the '
+                      'track mirrored; if not, negate linear_acceleration in the IMU driver. '
+                      f'{NO_ROTATION}')
     return ratio, (Reason(Code.GYRO_SIGN, text, remedy),)
 
 

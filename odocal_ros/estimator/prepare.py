@@ -130,7 +130,8 @@ def imperfection_sigmas(grade: Grade) -> Floats:
     Those of the IMU are from its grade. Receivers that smooth do so over a second. Most have no
     odometer: its usual error is small, with a wide range (SIZE_SPREADS). Clocks differ by
     20 ppm. The scale of tyres changes by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within
-    about ten minutes, and by slip of 0.4 % for each m/s^2. The path of an axle differs from that
+    about ten minutes, by slip of 0.4 % for each m/s^2, and, of one wheel, by 0.05 % for each m/s^2
+    in turns, which load or unload it (decisions/0009). The path of an axle differs from that
     along the pitching body by half the square of the pitch. A body pitches by 1.7 deg/g, the rear
     axle of a car slides by 0.3 deg per m/s^2, both with a delay of 0.1 s. Over a crest the body
     pitches about the middle of its wheelbase.

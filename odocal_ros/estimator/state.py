@@ -21,7 +21,7 @@ from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.rotations import exp_so3, skew
 
 # unknowns of a keyframe, and their numbers. Travel error: of the odometer reading, in scale units
-# (pulses, rad or configured m), bounded by rounding; slow fix error: the time-correlated one
+# (pulses, rad, or m of a speed), bounded by rounding; slow fix error: the time-correlated one
 BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
          'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU': 3}
 P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(

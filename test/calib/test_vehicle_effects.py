@@ -75,7 +75,7 @@ def rolled_differently(leg, drive, additional):
 
 
 @pytest.mark.parametrize('seed', [4, 5])
-def test_turns_load_or_relieve_a_wheel(seed):
+def test_turns_load_or_unload_a_wheel(seed):
     """The tyre of an odometer on one wheel is larger in turns to its own side."""
     drive, config, leg = made(**RTK | {'seed': seed})
     by_force = 1e-3     # per m/s^2

@@ -42,8 +42,9 @@ class PointRows(Factor):
     m measurements of d components each, such as fixes.
 
     A subclass sets raw, and share if its rows contain the correlated fix error. ``weigh`` sets r,
-    (m, d), the whitened residuals, and J_end, (m, 3, 3), their derivatives by the correlated fix
-    error of the keyframe after, or None.
+    (m, d), the whitened residuals, and their derivatives: J, (m, d, n + M), by the keyframe before
+    and the first M constants, those in use; J_end, (m, 3, 3), by the correlated fix error of the
+    keyframe after, or None.
     """
 
     level_columns: ClassVar[dict[str, slice]]     # components whose variances a level multiplies
@@ -74,7 +75,7 @@ class PointRows(Factor):
         return True
 
     def weigh(self, levels: Levels) -> None:
-        """Compute r, the whitened derivatives J, (m, d, n + M), and J_end, weighted."""
+        """Compute r, J and J_end with the weights of outliers."""
         white = self.whiten(self.raw[:, :, None])[:, :, 0]
         factor = np.ones(white.shape[1])
         for level, columns in self.level_columns.items():

@@ -266,8 +266,8 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def contains_odometer(scale_error: float, sigma: float) -> bool:
     """Return True if the positions contain an odometer, with this scale error and its sigma."""
-    # relative: smaller errors do not change a scale by more than its sigma
-    return bool(abs(scale_error) > max(FAULT_SIGMAS * sigma, 5e-4))
+    min_size = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
+    return bool(abs(scale_error) > max(FAULT_SIGMAS * sigma, min_size))
 
 
 def odometer_reasons(
